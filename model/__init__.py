@@ -1,0 +1,1 @@
+"""The workshop: GameSR's networks in torch, their training, reparameterization, export and verification."""

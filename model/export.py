@@ -1,0 +1,137 @@
+"""Networks and baselines as self-describing ONNX artifacts: uint8 planes and state in, uint8 planes and state out."""
+
+from __future__ import annotations
+
+import copy
+import json
+import logging
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import onnx
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from model.interpolation import Interpolation, chroma_shift
+from model.network import GameSR, Planes, State, parameter_count
+from model.reparam import fuse
+
+FORMAT_VERSION = "1"
+OPSET = 18
+
+
+def to_codes(plane: Tensor) -> Tensor:
+    """Float code values to uint8: rounded half to even, clamped to 0..255."""
+    return plane.round().clamp(0, 255).to(torch.uint8)
+
+
+class Baseline(nn.Module):
+    """Bicubic or Lanczos interpolation behind the artifact's contract; luma is centred, chroma left-sited.
+
+    Rounding to uint8 comes before PixelShuffle, which then moves a quarter of the bytes.
+    """
+
+    def __init__(self, kernel: str, scale: int) -> None:
+        super().__init__()
+        self.luma = Interpolation(kernel, scale, 2)
+        self.chroma = Interpolation(kernel, scale, 1, chroma_shift(scale))
+        self.side = scale
+
+    def forward(self, y: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        luma = F.pixel_shuffle(to_codes(self.luma(y.float())), 2 * self.side)
+        chroma = F.pixel_shuffle(to_codes(self.chroma(torch.cat((u, v)).float())), self.side)
+        return luma, chroma[:1], chroma[1:]
+
+
+class Frontend(nn.Module):
+    """A network behind the artifact's contract: casts, rounding, clamping and the sum of the state are part of the graph."""
+
+    def __init__(self, network: GameSR) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, y: Tensor, u: Tensor, v: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        frame = Planes(*(p.to(self.network.stem.weight.dtype) for p in (y, u, v)))
+        picture, after = self.network.step(frame, State(*state) if state else None)
+        planes = tuple(to_codes(p) for p in picture)
+        if after is None:
+            return planes
+        return (*planes, *after, after.h.sum() + after.c.sum())
+
+
+def export_network(network: GameSR, path: Path, *, name: str, card: dict[str, Any]) -> None:
+    """Fuse and write a network; `card` says where its weights come from. `network` itself is left as it is."""
+    config = network.config
+    fused = fuse(copy.deepcopy(network).float().eval())
+    assert isinstance(fused, GameSR)
+    state = [] if fused.lstm is None else [state_entry(part, config.channels, config.unshuffle) for part in State._fields]
+    card = {**card, "parameters": parameter_count(fused), "parameters_in_training": parameter_count(network)}
+    metadata = {
+        "name": name,
+        "scale": config.scale,
+        "size_multiple": config.size_multiple,
+        "precision": "float32",
+        "state": state,
+        "card": card,
+    }
+    _write(Frontend(fused), path, fused.initial_state(1, 2 * 12, 2 * 16), config.unshuffle, metadata)
+
+
+def export_baseline(kernel: str, scale: int, path: Path) -> None:
+    metadata = {"name": kernel, "scale": scale, "size_multiple": 2, "precision": "float32", "state": [], "card": {"interpolation": kernel}}
+    _write(Baseline(kernel, scale).float(), path, None, 1, metadata)
+
+
+def state_entry(part: str, channels: int, divisor: int) -> dict[str, object]:
+    return {"input": f"{part}_in", "output": f"{part}_out", "channels": channels, "divisor": divisor, "dtype": "float32"}
+
+
+@contextmanager
+def _quiet_exporter() -> Iterator[None]:
+    """Keeps out what torch's exporter says of torchvision, of its own deprecations and of axes that share a name."""
+    logger = logging.getLogger("torch.onnx._internal.exporter._registration")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+def _write(module: nn.Module, path: Path, state: State | None, divisor: int, metadata: dict[str, Any]) -> None:
+    chroma = torch.zeros(1, 1, 12, 16, dtype=torch.uint8)
+    luma = torch.zeros(1, 1, 24, 32, dtype=torch.uint8)
+    h2, w2 = torch.export.Dim("half_height", min=1), torch.export.Dim("half_width", min=1)
+    shapes: list[Any] = [{2: 2 * h2, 3: 2 * w2}, {2: h2, 3: w2}, {2: h2, 3: w2}]
+    cells = {2: h2, 3: w2} if divisor == 2 else {2: 2 * h2, 3: 2 * w2}
+    parts = [] if state is None else list(State._fields)
+    with _quiet_exporter():
+        program = torch.onnx.export(
+            module.eval(),
+            (luma, chroma, chroma.clone(), *(state or ())),  # a tensor given twice would become one input
+            dynamo=True,
+            opset_version=OPSET,
+            input_names=["y", "u", "v", *(f"{p}_in" for p in parts)],
+            output_names=["y_up", "u_up", "v_up", *(f"{p}_out" for p in parts), *(["state_sum"] if parts else [])],
+            dynamic_shapes={"y": shapes[0], "u": shapes[1], "v": shapes[2], "state": tuple(cells for _ in parts)}
+            if parts
+            else tuple(shapes),
+            optimize=True,
+            verbose=False,
+        )
+    assert program is not None
+    model = program.model_proto
+    for key, value in {"gamesr_format": FORMAT_VERSION, **metadata}.items():
+        text = value if isinstance(value, str) else json.dumps(value)
+        model.metadata_props.append(onnx.StringStringEntryProto(key=key, value=text))
+    onnx.checker.check_model(model, full_check=True)
+    partial = path.with_suffix(f".{os.getpid()}.partial")
+    onnx.save(model, str(partial))
+    partial.replace(path)

@@ -1,0 +1,232 @@
+"""Training: truncated back-propagation through time over clips, resumable to the same weights."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from client.errors import InputError, ModelError
+from model.footage import Degradation, FootageCache, Pair, load_pairs, load_scenes, sample_clips
+from model.network import PRESETS, GameSR, NetworkConfig, Planes, State
+
+CHECKPOINT_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that decides the weights, besides the footage's content; saved in every checkpoint.
+
+    A step is one optimizer update on `batch` crops of `window` frames; `frames` consecutive ones of the same crops are
+    `frames / window` steps, between which the state is carried but not differentiated. `patch` is in low-resolution pixels.
+    A degradation named twice is drawn twice as often.
+    The learning rate is halved `halvings` times over the run, as the paper halves it every 200,000 iterations.
+    """
+
+    preset: str = "planes"
+    scale: int = 2
+    games: tuple[str, ...] = ()
+    degradations: tuple[str, ...] = ("area", "area", "area", "area@2000", "area@4000", "area@8000")
+    steps: int = 5000
+    batch: int = 8
+    patch: int = 64
+    frames: int = 10
+    window: int = 5
+    learning_rate: float = 1e-3
+    halvings: int = 6
+    warm_up_steps: int = 100
+    weight_decay: float = 1e-4
+    charbonnier_eps: float = 1e-3
+    clip_norm: float = 1.0
+    seed: int = 0
+    bfloat16: bool = False
+    initial_weights: str = ""
+
+    def __post_init__(self) -> None:
+        if self.preset not in PRESETS:
+            raise InputError(f"no network is called {self.preset!r}: there are {', '.join(PRESETS)}")
+        if self.frames % self.window or self.patch % 2:
+            raise InputError("the clip length must be a multiple of the window, and the patch even")
+
+    def network(self) -> NetworkConfig:
+        return NetworkConfig(scale=self.scale, **PRESETS[self.preset])  # type: ignore[arg-type]
+
+    def rate_at(self, step: int) -> float:
+        warm = min(1.0, (step + 1) / self.warm_up_steps)
+        return self.learning_rate * warm * 0.5 ** int((self.halvings + 1) * step / self.steps)
+
+
+def charbonnier(output: Planes, target: Planes, eps: float) -> Tensor:
+    """Mean of sqrt(d^2 + eps^2) over all samples of all planes, d in units of the code range (paper, section 4.1)."""
+    total = sum(((a - b).div(255).square() + eps * eps).sqrt().sum() for a, b in zip(output, target, strict=True))
+    assert isinstance(total, Tensor)
+    return total / sum(plane.numel() for plane in target)
+
+
+def to_planes(arrays: list[np.ndarray], device: torch.device) -> Planes:
+    """uint8 arrays [y, u, v] as float planes of code values."""
+    return Planes(*(torch.from_numpy(np.require(a, requirements="W")).to(device, torch.float32) for a in arrays))
+
+
+class Trainer:
+    """One run in one folder: `checkpoint.pt` (whole or not there) and `log.jsonl`."""
+
+    def __init__(
+        self, config: TrainConfig, footage: Path, cache: FootageCache, folder: Path, *, device: str = "cpu", compiled: bool = False
+    ):
+        self.folder, self.config, self.device = folder, config, torch.device(device)
+        folder.mkdir(parents=True, exist_ok=True)
+        degradations = [Degradation.parse(text) for text in config.degradations]
+        self.train = load_pairs(load_scenes(footage, split="train", games=config.games), cache, config.scale, degradations)
+        held_out = load_scenes(footage, split="validate", games=config.games)
+        self.validate = load_pairs(held_out, cache, config.scale, dict.fromkeys(degradations))
+        short = [pair.title for takes in self.train for pair in takes if len(pair) < config.frames]
+        if short:
+            raise InputError(f"{short[0]} is shorter than a clip of {config.frames} frames")
+        torch.manual_seed(config.seed)
+        self.network = GameSR(config.network()).to(self.device)
+        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        if config.initial_weights:
+            self.network.load_state_dict(load_checkpoint(Path(config.initial_weights))["network"])
+        self.optimizer = torch.optim.AdamW(
+            self.network.parameters(), config.learning_rate, betas=(0.9, 0.999), weight_decay=config.weight_decay
+        )
+        self.forward: Any = torch.compile(self.network) if compiled else self.network
+        self.step = 0
+        self.seconds = 0.0
+        if (folder / "checkpoint.pt").exists():
+            self._resume()
+
+    def _resume(self) -> None:
+        saved = load_checkpoint(self.folder / "checkpoint.pt")
+        if saved["config"] != asdict(self.config):
+            different = [k for k, v in asdict(self.config).items() if saved["config"].get(k) != v]
+            raise InputError(f"{self.folder} holds a run of another configuration ({', '.join(different)}): choose another folder")
+        self.network.load_state_dict(saved["network"])
+        self.optimizer.load_state_dict(saved["optimizer"])
+        self.step, self.seconds = saved["step"], saved["seconds"]
+
+    def save(self) -> None:
+        state = {
+            "format": CHECKPOINT_FORMAT,
+            "config": asdict(self.config),
+            "scenes": [sorted({pair.title.split()[0] for takes in pairs for pair in takes}) for pairs in (self.train, self.validate)],
+            "network": self.network.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "step": self.step,
+            "seconds": self.seconds,
+        }
+        partial = self.folder / f"checkpoint.{os.getpid()}.partial"
+        torch.save(state, partial)
+        partial.replace(self.folder / "checkpoint.pt")
+
+    def losses(self) -> Iterator[float]:
+        """Train to the last step of the configuration, giving the loss after every step; checkpoints only fall between clips."""
+        config = self.config
+        per_clip = config.frames // config.window
+        while self.step < config.steps:
+            arrays = sample_clips(
+                self.train,
+                seed=config.seed,
+                index=self.step // per_clip,
+                batch=config.batch,
+                frames=config.frames,
+                patch=config.patch,
+                scale=config.scale,
+            )
+            low, high = (to_planes(a, self.device) for a in arrays)
+            state = self.network.initial_state(config.batch, config.patch, config.patch)
+            for first in range(0, config.frames, config.window):
+                span = slice(first, first + config.window)
+                started = time.perf_counter()
+                loss, state = self._update(Planes(*(p[:, span] for p in low)), Planes(*(p[:, span] for p in high)), state)
+                self.seconds += time.perf_counter() - started
+                yield loss
+
+    def _update(self, low: Planes, high: Planes, state: State | None) -> tuple[float, State | None]:
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.config.rate_at(self.step)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.bfloat16):
+            output, state = self.forward(low, state)
+        loss = charbonnier(output, high, self.config.charbonnier_eps)
+        self.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip_norm)
+        self.optimizer.step()
+        self.step += 1
+        value = loss.item()
+        if not np.isfinite(value):
+            raise ModelError(f"the loss is {value} at step {self.step}: lower the learning rate")
+        return value, state if state is None else State(*(t.detach() for t in state))
+
+    def validation(self, frames: int = 5) -> dict[str, dict[str, float]]:
+        """PSNR-Y of the network and of bicubic in dB on the first frames of every held-out take, full size, state carried."""
+        return {pair.title: psnr_y_beside_bicubic(self.network, pair, frames) for takes in self.validate for pair in takes}
+
+    def run(self, *, validate_every: int, progress: bool) -> None:
+        """Train to the end, validating and saving as it goes, with a progress bar on stderr if wanted."""
+        per_clip = self.config.frames // self.config.window
+        bar = tqdm(total=self.config.steps, initial=self.step, unit="step", disable=not progress, mininterval=1.0)
+        recent: list[float] = []
+        gain = ""
+        with bar, (self.folder / "log.jsonl").open("a") as log:
+            for loss in self.losses():
+                recent.append(loss)
+                bar.update()
+                bar.set_postfix_str(f"loss {np.mean(recent[-100:]):.5f} {gain}", refresh=False)
+                done = self.step >= self.config.steps
+                if done or (self.step % per_clip == 0 and self.step // per_clip % max(1, validate_every // per_clip) == 0):
+                    self.save()
+                    held_out = self.validation()
+                    gain = "held-out PSNR-Y over bicubic {:+.2f} dB".format(
+                        np.mean([r["psnr_y_db"] - r["bicubic_db"] for r in held_out.values()])
+                    )
+                    row = {"step": self.step, "loss": float(np.mean(recent)), "train_s": round(self.seconds, 1), "validation": held_out}
+                    log.write(json.dumps(row) + "\n")
+                    log.flush()
+                    recent.clear()
+
+
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """A checkpoint's dictionary; raises ModelError when the file is not one. Nothing in it is executed."""
+    try:
+        saved = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises whatever the unpickler met
+        raise ModelError(f"{path} is not a checkpoint: {error}") from error
+    if not isinstance(saved, dict) or saved.get("format") != CHECKPOINT_FORMAT:
+        raise ModelError(f"{path} is not a checkpoint of format {CHECKPOINT_FORMAT}")
+    return saved
+
+
+def network_of(checkpoint: dict[str, Any]) -> GameSR:
+    """The network in training form with a checkpoint's weights."""
+    network = GameSR(TrainConfig(**checkpoint["config"]).network())
+    network.load_state_dict(checkpoint["network"])
+    return network
+
+
+@torch.no_grad()
+def psnr_y_beside_bicubic(network: GameSR, pair: Pair, frames: int) -> dict[str, float]:
+    """PSNR-Y in dB from the mean MSE of rounded luma over the first frames, for the network and its own bicubic base."""
+    device = network.stem.weight.device
+    bicubic = GameSR(replace(network.config, colour="planes", unshuffle=2, blocks=0, recurrent=False)).to(device)
+    low, high = ([plane[:frames, None, None] for plane in take.planes()] for take in (pair.low, pair.high))
+    state = network.initial_state(1, pair.low.height, pair.low.width)
+    errors = np.zeros(2)
+    count = min(frames, len(pair))
+    for t in range(count):
+        frame, target = to_planes([p[t] for p in low], device), torch.from_numpy(high[0][t]).to(device, torch.float32)
+        ours, state = network.step(frame, state)
+        base, _ = bicubic.step(frame, None)
+        errors += [float((picture.y.round().clamp(0, 255) - target).square().mean()) for picture in (ours, base)]
+    ours_db, bicubic_db = 10 * np.log10(255**2 * count / errors)
+    return {"psnr_y_db": float(ours_db), "bicubic_db": float(bicubic_db)}
