@@ -1,20 +1,28 @@
-"""gamesr-train: weights from footage."""
+"""gamesr-train, gamesr-export, gamesr-verify and gamesr-evaluate: weights from footage, artifacts from weights, figures from both."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
-from collections.abc import Sequence
-from dataclasses import fields
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 import torch
+from tqdm import tqdm
 
-from client.errors import GamesrError
-from model.footage import FootageCache
+from client.errors import GamesrError, ModelError
+from client.models import WEIGHTS
+from client.video import VideoSource
+from model.cards import card_page, training_card
+from model.evaluate import evaluate, table
+from model.export import export_baseline, export_network
+from model.footage import Degradation, FootageCache, load_scenes
 from model.network import PRESETS
-from model.train import TrainConfig, Trainer
+from model.train import TrainConfig, Trainer, load_checkpoint, network_of
+from model.verify import crop, parity, parse_size
 
 TRAIN_EXAMPLES = """\
 The footage list is a TOML file of scenes (see model/footage.py); scenes are split by map or track. A run lives in one
@@ -69,9 +77,10 @@ def train_main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     names = {f.name for f in fields(TrainConfig)}
     given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in vars(arguments).items() if k in names}
-    if arguments.threads:
-        torch.set_num_threads(arguments.threads)
-    try:
+
+    def work() -> None:
+        if arguments.threads:
+            torch.set_num_threads(arguments.threads)
         trainer = Trainer(
             TrainConfig(**given),
             arguments.footage,
@@ -81,12 +90,128 @@ def train_main(argv: Sequence[str] | None = None) -> int:
             compiled=arguments.compile,
         )
         trainer.run(validate_every=arguments.validate_every, progress=sys.stderr.isatty())
+
+    return _run(parser, arguments, work, f"stopped; the same command goes on from the last checkpoint in {arguments.run}")
+
+
+def export_main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        prog="gamesr-export",
+        description="Write a trained network, or a baseline, as a self-describing ONNX artifact, its model card beside it.",
+        epilog="examples:\n  gamesr-export runs/openarena_x2/checkpoint.pt gamesr-openarena\n  gamesr-export bicubic bicubic",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("weights", help="a run's checkpoint.pt; or bicubic or lanczos, for both scales")
+    parser.add_argument("name", help="the model's name; its files are NAME_xSCALE.onnx and .md")
+    parser.add_argument("--folder", type=Path, default=WEIGHTS, help="where to (default: %(default)s)")
+    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
+    arguments = parser.parse_args(argv)
+
+    def work() -> None:
+        if arguments.weights in ("bicubic", "lanczos"):
+            for scale in (2, 3):
+                export_baseline(arguments.weights, scale, arguments.folder / f"{arguments.name}_x{scale}.onnx")
+            return
+        checkpoint = load_checkpoint(Path(arguments.weights))
+        network = network_of(checkpoint)
+        path = arguments.folder / f"{arguments.name}_x{network.config.scale}.onnx"
+        card = export_network(network, path, name=arguments.name, card=training_card(checkpoint))
+        path.with_suffix(".md").write_text(card_page(arguments.name, network.config.scale, card))
+        print(path)
+
+    return _run(parser, arguments, work, "stopped")
+
+
+def verify_main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        prog="gamesr-verify",
+        description="Hold an artifact in ONNX Runtime against its own weights in torch float64, over many recurrent steps of a clip.",
+    )
+    parser.add_argument("model", type=Path, help="a trained .onnx artifact")
+    parser.add_argument("clip", type=Path, help="a low-resolution video; it is played forwards and backwards")
+    parser.add_argument("--steps", type=int, default=300, help="recurrent steps (default: %(default)s)")
+    parser.add_argument("--crop", default="320x180", metavar="WxH", help="the middle of the picture, both even (default: %(default)s)")
+    parser.add_argument("--json", action="store_true", help="a JSON line a step instead of the table")
+    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
+    arguments = parser.parse_args(argv)
+
+    def work() -> None:
+        width, height = parse_size(arguments.crop)
+        with VideoSource(arguments.clip) as source:
+            frames = [crop(item.frame, width, height) for item in source]
+        shown = {1, 10, 100, arguments.steps}
+        worst = 0
+        for error in parity(arguments.model, frames, arguments.steps):
+            worst = max(worst, error.max_code_error)
+            if arguments.json:
+                print(json.dumps(asdict(error)))
+            elif error.step in shown or error.step % 100 == 0:
+                picture = f"picture within {error.max_code_error} code values, {error.differing_pixels:.1e} of the samples differ"
+                state = f"state within {error.max_state_error:.1e}, RMS {error.rms_state_error:.1e}"
+                print(f"step {error.step:5}: {picture}; {state}")
+        if worst > 1:
+            raise ModelError(f"{arguments.model} differs from its float64 reference by {worst} code values")
+
+    return _run(parser, arguments, work, "stopped")
+
+
+def evaluate_main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        prog="gamesr-evaluate",
+        description="Measure models on test scenes: downscaled, encoded as a cloud encoder does, upscaled, held against the reference.",
+        epilog="example:\n  gamesr-evaluate tests/footage/footage.toml --models bicubic lanczos gamesr --scales 2",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("footage", type=Path, help="the footage list, a TOML file")
+    parser.add_argument("--split", choices=("validate", "test"), default="test", help="which scenes (default: %(default)s)")
+    parser.add_argument("--games", nargs="+", default=[], metavar="GAME", help="these games only (default: all)")
+    parser.add_argument("--models", nargs="+", default=["bicubic", "lanczos", "gamesr-paper", "gamesr"], metavar="NAME|FILE")
+    parser.add_argument("--scales", nargs="+", type=int, choices=(2, 3), default=[2, 3])
+    parser.add_argument("--degradations", nargs="+", default=["area", "area@8000", "area@4000"], metavar="HOW")
+    parser.add_argument("--frames", type=int, default=60, help="of each scene, from its start (default: %(default)s)")
+    parser.add_argument("--threads", type=int, help="threads of the network (default: the physical cores)")
+    parser.add_argument("--rows", type=Path, default=Path("runs/evaluation.jsonl"), help="measured rows, kept (default: %(default)s)")
+    parser.add_argument("--cache", type=Path, default=Path("runs/cache"), help="decoded footage, may be deleted (default: %(default)s)")
+    parser.add_argument("--json", action="store_true", help="a JSON line a row instead of the table")
+    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
+    arguments = parser.parse_args(argv)
+
+    def work() -> None:
+        scenes = load_scenes(arguments.footage, split=arguments.split, games=arguments.games)
+        degradations = [Degradation.parse(text) for text in arguments.degradations]
+        arguments.rows.parent.mkdir(parents=True, exist_ok=True)
+        rows = evaluate(
+            scenes,
+            FootageCache(arguments.cache),
+            models=arguments.models,
+            scales=arguments.scales,
+            degradations=degradations,
+            frames=arguments.frames,
+            threads=arguments.threads,
+            store=arguments.rows,
+        )
+        total = len(scenes) * len(arguments.scales) * len(degradations) * len(arguments.models)
+        measured = []
+        for row in tqdm(rows, total=total, unit="row", disable=not sys.stderr.isatty()):
+            measured.append(row)
+            if arguments.json:
+                print(json.dumps(row), flush=True)
+        if not arguments.json:
+            print(table(measured))
+
+    return _run(parser, arguments, work, f"stopped; the same command goes on from the rows in {arguments.rows}")
+
+
+def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace, work: Callable[[], None], interrupted: str) -> int:
+    """The exit status: 1 and one sentence for what went wrong, 130 for Ctrl-C."""
+    try:
+        work()
     except GamesrError as error:
         if arguments.debug:
             raise
-        print(f"gamesr-train: {error}", file=sys.stderr)
+        print(f"{parser.prog}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print(f"gamesr-train: stopped; the same command goes on from the last checkpoint in {arguments.run}", file=sys.stderr)
+        print(f"{parser.prog}: {interrupted}", file=sys.stderr)
         return 130
     return 0

@@ -9,6 +9,7 @@ import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -64,13 +65,16 @@ class Frontend(nn.Module):
         return (*planes, *after, after.h.sum() + after.c.sum())
 
 
-def export_network(network: GameSR, path: Path, *, name: str, card: dict[str, Any]) -> None:
-    """Fuse and write a network; `card` says where its weights come from. `network` itself is left as it is."""
+def export_network(network: GameSR, path: Path, *, name: str, card: dict[str, Any]) -> dict[str, Any]:
+    """Fuse and write a network; `card` says where its weights come from and is returned whole, shape and counts added.
+
+    `network` itself is left as it is.
+    """
     config = network.config
     fused = fuse(copy.deepcopy(network).float().eval())
     assert isinstance(fused, GameSR)
     state = [] if fused.lstm is None else [state_entry(part, config.channels, config.unshuffle) for part in State._fields]
-    card = {**card, "parameters": parameter_count(fused), "parameters_in_training": parameter_count(network)}
+    card = {**card, "network": asdict(config), "parameters": parameter_count(fused), "parameters_in_training": parameter_count(network)}
     metadata = {
         "name": name,
         "scale": config.scale,
@@ -80,6 +84,7 @@ def export_network(network: GameSR, path: Path, *, name: str, card: dict[str, An
         "card": card,
     }
     _write(Frontend(fused), path, fused.initial_state(1, 2 * 12, 2 * 16), config.unshuffle, metadata)
+    return card
 
 
 def export_baseline(kernel: str, scale: int, path: Path) -> None:

@@ -150,7 +150,7 @@ class GameSR(nn.Module):
             return None
         s = self.config.unshuffle
         zeros = self.stem.weight.new_zeros(batch, self.config.channels, height // s, width // s)
-        return State(zeros, zeros)
+        return State(zeros, torch.zeros_like(zeros))  # two tensors: an exporter takes one given twice for one input
 
     def step(self, frame: Planes, state: State | None) -> tuple[Planes, State | None]:
         """One frame, planes (N, 1, H, W) and (N, 1, H/2, W/2), and the state after it."""

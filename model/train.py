@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from client.errors import InputError, ModelError
-from model.footage import Degradation, FootageCache, Pair, load_pairs, load_scenes, sample_clips
+from model.footage import Degradation, FootageCache, Pair, by_game, load_pairs, load_scenes, sample_clips
 from model.network import PRESETS, GameSR, NetworkConfig, Planes, State
 
 CHECKPOINT_FORMAT = 1
@@ -101,8 +103,13 @@ class Trainer:
             self.network.parameters(), config.learning_rate, betas=(0.9, 0.999), weight_decay=config.weight_decay
         )
         self.forward: Any = torch.compile(self.network) if compiled else self.network
+        self.footage = {
+            split: [f"{pair.title.split()[0]} ({len(pair)} frames)" for pair in (takes[0] for takes in pairs)]
+            for split, pairs in (("train", self.train), ("validate", self.validate))
+        }
         self.step = 0
         self.seconds = 0.0
+        self.held_out: dict[str, dict[str, float]] = {}
         if (folder / "checkpoint.pt").exists():
             self._resume()
 
@@ -113,17 +120,20 @@ class Trainer:
             raise InputError(f"{self.folder} holds a run of another configuration ({', '.join(different)}): choose another folder")
         self.network.load_state_dict(saved["network"])
         self.optimizer.load_state_dict(saved["optimizer"])
-        self.step, self.seconds = saved["step"], saved["seconds"]
+        self.step, self.seconds, self.held_out = saved["step"], saved["seconds"], saved["held_out"]
 
     def save(self) -> None:
         state = {
             "format": CHECKPOINT_FORMAT,
             "config": asdict(self.config),
-            "scenes": [sorted({pair.title.split()[0] for takes in pairs for pair in takes}) for pairs in (self.train, self.validate)],
+            "footage": self.footage,
+            "commit": source_commit(),
+            "device": torch.cuda.get_device_name() if self.device.type == "cuda" else f"CPU, {torch.get_num_threads()} threads",
             "network": self.network.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "step": self.step,
             "seconds": self.seconds,
+            "held_out": self.held_out,
         }
         partial = self.folder / f"checkpoint.{os.getpid()}.partial"
         torch.save(state, partial)
@@ -135,7 +145,7 @@ class Trainer:
         per_clip = config.frames // config.window
         while self.step < config.steps:
             arrays = sample_clips(
-                self.train,
+                by_game(self.train),
                 seed=config.seed,
                 index=self.step // per_clip,
                 batch=config.batch,
@@ -182,18 +192,26 @@ class Trainer:
             for loss in self.losses():
                 recent.append(loss)
                 bar.update()
-                bar.set_postfix_str(f"loss {np.mean(recent[-100:]):.5f} {gain}", refresh=False)
+                bar.set_postfix_str(f"loss {fmean(recent[-100:]):.5f} {gain}", refresh=False)
                 done = self.step >= self.config.steps
                 if done or (self.step % per_clip == 0 and self.step // per_clip % max(1, validate_every // per_clip) == 0):
+                    self.held_out = self.validation()
                     self.save()
-                    held_out = self.validation()
-                    gain = "held-out PSNR-Y over bicubic {:+.2f} dB".format(
-                        np.mean([r["psnr_y_db"] - r["bicubic_db"] for r in held_out.values()])
-                    )
-                    row = {"step": self.step, "loss": float(np.mean(recent)), "train_s": round(self.seconds, 1), "validation": held_out}
+                    gains = [r["psnr_y_db"] - r["bicubic_db"] for r in self.held_out.values()]
+                    gain = f"held-out PSNR-Y over bicubic {fmean(gains):+.2f} dB"
+                    row = {"step": self.step, "loss": fmean(recent), "train_s": round(self.seconds, 1), "held_out": self.held_out}
                     log.write(json.dumps(row) + "\n")
                     log.flush()
                     recent.clear()
+
+
+def source_commit() -> str:
+    """The commit of the checkout that this code runs from, or "unknown" for an installed package."""
+    try:
+        command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:

@@ -1,0 +1,152 @@
+"""What an artifact says of itself, and a session made from one that the client understands."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import onnxruntime as ort
+
+from client.errors import ModelError, ProviderError
+
+FORMAT = "1"
+MAX_FILE_BYTES = 64 * 2**20
+MAX_STATE_CHANNELS = 4096
+PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider", "openvino": "OpenVINOExecutionProvider"}
+_TENSOR_TYPES = {"float32": "tensor(float)", "float16": "tensor(float16)"}
+
+
+@dataclass(frozen=True)
+class StateSpec:
+    """A state tensor of shape (1, channels, H / divisor, W / divisor): the graph's input and output of it, and its dtype."""
+
+    input: str
+    output: str
+    channels: int
+    divisor: int
+    dtype: str
+
+
+@dataclass(frozen=True)
+class ModelSpec:
+    """What the exporter wrote into the artifact; `sha256` is of the file, `card` holds free facts of the training."""
+
+    name: str
+    scale: int
+    size_multiple: int
+    precision: str
+    state: tuple[StateSpec, ...]
+    sha256: str
+    card: dict[str, Any] = field(hash=False)
+
+
+def load_session(model: Path, provider: str, threads: int) -> tuple[ort.InferenceSession, ModelSpec]:
+    """Read an artifact, check that it is one the client understands, and make a session of it.
+
+    The runtime is given bytes, never a path, so a model cannot make it read other files. Raises ModelError or ProviderError.
+    """
+    _check_provider(provider)
+    content = _read(model)
+    try:
+        session = ort.InferenceSession(content, _session_options(threads), providers=[PROVIDERS[provider]])
+    except Exception as error:  # the runtime's exceptions have no common base
+        raise ModelError(f"{model} is not a readable ONNX model: it is damaged or of another kind") from error
+    if PROVIDERS[provider] not in session.get_providers():
+        raise ProviderError(f"ONNX Runtime could not start its {provider} provider: check the driver, or use --provider cpu")
+    try:
+        spec = _read_spec(session.get_modelmeta().custom_metadata_map, hashlib.sha256(content).hexdigest())
+        _check_tensors(session, spec)
+    except _NotUnderstood as reason:
+        raise ModelError(f"{model} is not a model that this client understands: {reason}") from None
+    return session, spec
+
+
+class _NotUnderstood(Exception):
+    pass
+
+
+def _check_provider(provider: str) -> None:
+    if provider not in PROVIDERS:
+        raise ProviderError(f"there is no provider {provider!r}: choose one of {', '.join(PROVIDERS)}")
+    if PROVIDERS[provider] not in ort.get_available_providers():
+        raise ProviderError(f"this ONNX Runtime has no {provider} provider: install it with pip install 'gamesr[{provider}]'")
+
+
+def _read(model: Path) -> bytes:
+    try:
+        if model.stat().st_size > MAX_FILE_BYTES:
+            raise ModelError(f"{model} is larger than {MAX_FILE_BYTES // 2**20} MiB: it is not a GameSR model")
+        return model.read_bytes()
+    except OSError as error:
+        raise ModelError(f"model {model} cannot be read: {error.strerror}") from error
+
+
+def _session_options(threads: int) -> ort.SessionOptions:
+    options = ort.SessionOptions()
+    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
+    options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    # A game, a decoder and an encoder want the cores too: threads that spin while they wait cost a half more under load.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.log_severity_level = 4  # a refused model is one sentence of ours, not the runtime's log
+    # Weights kept outside the file would be looked up in the working directory; there is nothing to be found in here.
+    options.add_session_config_entry("session.model_external_initializers_file_folder_path", os.devnull)
+    return options
+
+
+def _read_spec(metadata: dict[str, str], sha256: str) -> ModelSpec:
+    version = metadata.get("gamesr_format")
+    if version is None:
+        raise _NotUnderstood("it does not say gamesr_format, so it was not made by gamesr-export")
+    if version != FORMAT:
+        raise _NotUnderstood(f"its format is {version!r}, this client reads {FORMAT!r}")
+    try:
+        spec = ModelSpec(
+            name=metadata["name"],
+            scale=int(metadata["scale"]),
+            size_multiple=int(metadata["size_multiple"]),
+            precision=metadata["precision"],
+            state=tuple(StateSpec(**entry) for entry in json.loads(metadata["state"])),
+            sha256=sha256,
+            card=dict(json.loads(metadata["card"])),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise _NotUnderstood(f"its metadata is incomplete or wrong ({error})") from error
+    if not all(text.isascii() and text.isprintable() and 0 < len(text) <= 64 for text in (spec.name, spec.precision)):
+        raise _NotUnderstood("its name or its precision is not a short word")
+    if spec.scale not in (2, 3):
+        raise _NotUnderstood(f"its scale is {spec.scale}, not 2 or 3")
+    if not 2 <= spec.size_multiple <= 64 or spec.size_multiple % 2:
+        raise _NotUnderstood(f"its size multiple is {spec.size_multiple}, not an even number up to 64")
+    for state in spec.state:
+        if state.dtype not in _TENSOR_TYPES:
+            raise _NotUnderstood(f"its state {state.input} is {state.dtype}")
+        if not _is_count(state.channels, MAX_STATE_CHANNELS) or not _is_count(state.divisor, 64) or spec.size_multiple % state.divisor:
+            raise _NotUnderstood(f"its state {state.input} has {state.channels} channels at 1/{state.divisor} of the size")
+    return spec
+
+
+def _is_count(value: object, limit: int) -> bool:
+    return isinstance(value, int) and 0 < value <= limit
+
+
+def _check_tensors(session: ort.InferenceSession, spec: ModelSpec) -> None:
+    inputs = dict.fromkeys(("y", "u", "v"), ("tensor(uint8)", 4))
+    outputs = dict.fromkeys(("y_up", "u_up", "v_up"), ("tensor(uint8)", 4))
+    for state in spec.state:
+        inputs[state.input] = outputs[state.output] = (_TENSOR_TYPES[state.dtype], 4)
+    if spec.state:
+        outputs["state_sum"] = ("tensor(float)", 0)
+    for kind, wanted, found in (("inputs", inputs, session.get_inputs()), ("outputs", outputs, session.get_outputs())):
+        there = {tensor.name: (tensor.type, len(tensor.shape)) for tensor in found}
+        if there != wanted:
+            raise _NotUnderstood(f"its {kind} are {_listing(there)}, not {_listing(wanted)}")
+
+
+def _listing(tensors: dict[str, tuple[str, int]]) -> str:
+    return ", ".join(f"{name} {kind.removeprefix('tensor')} rank {rank}" for name, (kind, rank) in tensors.items())

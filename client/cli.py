@@ -1,0 +1,196 @@
+"""gamesr-upscale: a low-resolution game video in, the upscaled video out."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import FrameType
+
+from client.artifact import PROVIDERS
+from client.baselines import Baselines
+from client.compare import ComparisonWriter
+from client.errors import GamesrError, InputError, ModelError, OutputError
+from client.models import DEFAULT_MODEL, find_model
+from client.pipeline import upscale_stream
+from client.progress import Progress
+from client.reference import Reference
+from client.sink import FileSink
+from client.summary import Summary
+from client.timing import Stamps
+from client.upscaler import OnnxUpscaler
+from client.video import VideoSource
+
+PROGRAM = "gamesr-upscale"
+EXAMPLES = """\
+examples:
+  gamesr-upscale match.mp4
+      writes match_gamesr_x2.mp4 beside it, twice as wide and high, audio copied
+  gamesr-upscale match_540p.mp4 -o match.mkv --reference match_1080p.mp4 --compare wipe.png
+      also says how close this came to the original, bicubic and Lanczos beside it, and draws the difference
+  gamesr-upscale match.mp4 --model bicubic --scale 3
+      a baseline in the network's place
+
+Figures of speed leave out warm-up, measuring and comparing. The output is encoded with x264 at crf 12, so that it shows
+the network's work. Exit status: 0 done, 1 refused or failed (one sentence says why, nothing is left behind), 2 wrong
+usage, 130 interrupted.
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM,
+        description="Upscale a game video frame by frame with a small recurrent network.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("input", metavar="INPUT", type=Path, help="the video: H.264 or another codec, 8-bit, progressive")
+    parser.add_argument("-o", "--output", metavar="OUT", type=Path, help=".mp4 or .mkv (default: INPUT_gamesr_xSCALE beside the input)")
+    parser.add_argument(
+        "--model", metavar="NAME|FILE", default=DEFAULT_MODEL, help="a shipped model or an .onnx file (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--scale", type=int, choices=(2, 3), help="how many times as wide and high (default: 2, or what the model FILE is for)"
+    )
+    parser.add_argument("--provider", choices=tuple(PROVIDERS), default="cpu", help="what runs the network (default: %(default)s)")
+    parser.add_argument("--threads", metavar="N", type=_thread_count, help="threads of the network (default: the physical cores)")
+    parser.add_argument(
+        "--reference", metavar="HR", type=Path, help="the original, SCALE times as large: measure against it, frame by frame"
+    )
+    parser.add_argument("--compare", metavar="FILE", type=Path, help="draw bicubic against ours, as .png or .mp4")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of the summary")
+    parser.add_argument("--force", action="store_true", help="replace files that exist")
+    parser.add_argument("--debug", action="store_true", help="show where an error came from")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit status."""
+    arguments = parser().parse_args(argv)
+    for signum in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signum, _interrupt)
+    try:
+        summary = upscale(arguments)
+        print(json.dumps(summary.record()) if arguments.json else summary.text(), flush=True)
+    except KeyboardInterrupt:
+        return _fail("interrupted, nothing was written", 130)
+    except GamesrError as error:
+        if arguments.debug:
+            traceback.print_exc()
+        return _fail(str(error), 1)
+    except MemoryError:
+        return _fail(f"not enough memory to upscale {arguments.input}: use a smaller video or scale", 1)
+    except BrokenPipeError:
+        # Whoever read the summary has gone; the interpreter would complain again when it flushes at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    return 0
+
+
+def upscale(arguments: argparse.Namespace) -> Summary:
+    """Everything between the arguments and the summary. Raises GamesrError, and leaves nothing behind when it does."""
+    with ExitStack() as stack:
+        source = stack.enter_context(VideoSource(arguments.input))
+        model = find_model(arguments.model, arguments.scale or 2)
+        upscaler = OnnxUpscaler(model, provider=arguments.provider, threads=arguments.threads)
+        scale = upscaler.spec.scale
+        if arguments.scale not in (None, scale):
+            raise ModelError(f"model {model} upscales by {scale}, not by {arguments.scale}: leave out --scale or name another model")
+        output = arguments.output or _default_output(arguments.input, scale)
+        _check_distinct(output, arguments)
+        sink = stack.enter_context(FileSink(output, source, force=arguments.force))
+        size = source.width * scale, source.height * scale
+        reference = comparison = baselines = None
+        if arguments.reference:
+            reference = stack.enter_context(Reference(arguments.reference, *size, ("ours", "bicubic", "lanczos")))
+        if arguments.compare:
+            comparison = stack.enter_context(
+                ComparisonWriter(arguments.compare, source, labels=("bicubic", upscaler.spec.name), force=arguments.force)
+            )
+        if reference or comparison:
+            names = ("bicubic", "lanczos") if reference else ("bicubic",)
+            baselines = Baselines(names, scale, provider=arguments.provider, threads=arguments.threads)
+        upscaler.warm_up(source.height, source.width)
+
+        stamps: list[Stamps] = []
+        damaged_frames = state_resets = 0
+        progress = stack.enter_context(Progress(sys.stderr, source.estimated_frames))
+        for done in upscale_stream(source, upscaler, sink):
+            stamps.append(done.stamps)
+            damaged_frames += done.decoded.damaged
+            state_resets += done.restart is not None
+            if baselines:
+                pictures = baselines.upscale(done.decoded)
+                if reference:
+                    reference.add({"ours": done.picture, **pictures})
+                if comparison:
+                    comparison.add(pictures["bicubic"], done.picture)
+            progress.advance()
+        if not stamps:
+            raise InputError(f"no frame of {arguments.input} could be decoded ({source.decode_errors} packets were refused)")
+        quality = reference.result() if reference else {}
+        notes = _source_notes(source, len(stamps), measured=reference is not None) + (reference.notes if reference else [])
+    return Summary(
+        input=arguments.input,
+        output=output,
+        input_size=(source.width, source.height),
+        output_size=size,
+        model=upscaler.spec,
+        provider=upscaler.provider,
+        threads=upscaler.threads,
+        stamps=stamps,
+        decode_errors=source.decode_errors,
+        damaged_frames=damaged_frames,
+        state_resets=state_resets,
+        quality=quality,
+        notes=notes + sink.notes,
+    )
+
+
+def _source_notes(source: VideoSource, frames: int, *, measured: bool) -> list[str]:
+    notes = []
+    if source.announced_frames is not None and source.announced_frames != frames:
+        notes.append(f"the file announces {source.announced_frames} frames, {frames} could be decoded")
+        if measured:
+            notes.append("frames are measured by their number, so after a missing one they meet the wrong frame of the reference")
+    return notes
+
+
+def _default_output(path: Path, scale: int) -> Path:
+    suffix = ".mkv" if path.suffix.lower() == ".mkv" else ".mp4"
+    return path.with_name(f"{path.stem}_gamesr_x{scale}{suffix}")
+
+
+def _check_distinct(output: Path, arguments: argparse.Namespace) -> None:
+    """No file may be written that is read, or written twice, whatever --force says."""
+    taken = {path.resolve(): what for path, what in ((arguments.input, "the input"), (arguments.reference, "the reference")) if path}
+    for path in (output, arguments.compare):
+        if path and path.resolve() in taken:
+            raise OutputError(f"cannot write {path}: it is {taken[path.resolve()]}")
+        if path:
+            taken[path.resolve()] = "the output"
+
+
+def _thread_count(text: str) -> int:
+    count = int(text)
+    if not 1 <= count <= 1024:
+        raise argparse.ArgumentTypeError(f"{text} is not between 1 and 1024")
+    return count
+
+
+def _interrupt(signum: int, frame: FrameType | None) -> None:
+    # A second signal must not stop the removal of the unfinished file.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    raise KeyboardInterrupt
+
+
+def _fail(sentence: str, status: int) -> int:
+    print(f"{PROGRAM}: {sentence}", file=sys.stderr)
+    return status

@@ -1,0 +1,34 @@
+"""Small letters for the labels on comparison pictures: printable ASCII in a 5x7 dot matrix."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Mask = NDArray[np.bool_]
+
+HEIGHT, WIDTH = 7, 5
+ADVANCE = WIDTH + 1
+
+# Five columns a letter from space to tilde, the least significant bit at the top.
+_COLUMNS = np.frombuffer(
+    bytes.fromhex(
+        "000000000000005f00000007000700147f147f14242a7f2a12231308646236495522500005030000001c2241000041221c0014083e081408083e0808"
+        "00503000000808080808006060000020100804023e5149453e00427f400042615149462141454b311814127f1027454545393c4a4949300171090503"
+        "3649494936064949291e003636000000563600000814224100141414141400412214080201510906324979413e7e1111117e7f494949363e41414122"
+        "7f4141221c7f494949417f090909013e4149497a7f0808087f00417f41002040413f017f081422417f404040407f020c027f7f0408107f3e4141413e"
+        "7f090909063e4151215e7f09192946464949493101017f01013f4040403f1f2040201f3f4038403f631408146307087008076151494543007f414100"
+        "02040810200041417f0004020102044040404040000102040020545454787f484444383844444420384444487f3854545418087e090102085454543c"
+        "7f0804047800447d40002040443d007f1028440000417f40007c041804787c0804047838444444387c14141408081414187c7c080404084854545420"
+        "043f4440203c4040207c1c2040201c3c4030403c44281028440c5050503c4464544c44000836410000007f000000413608001008100808"
+    ),
+    np.uint8,
+).reshape(-1, WIDTH)
+
+
+def letters(text: str, size: int) -> Mask:
+    """`text` as dots that are set, bool (7 * size, 6 * size * len(text)); what is not printable ASCII becomes a question mark."""
+    codes = [ord(letter) - 32 if " " <= letter <= "~" else ord("?") - 32 for letter in text]
+    columns = np.pad(_COLUMNS[codes], ((0, 0), (0, ADVANCE - WIDTH))).reshape(-1)
+    rows = (columns[None, :] >> np.arange(HEIGHT)[:, None]) & 1
+    return rows.astype(bool).repeat(size, axis=0).repeat(size, axis=1)

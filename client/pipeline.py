@@ -1,0 +1,65 @@
+"""The one way from a stream to upscaled pictures: the command line, a player, a sweep and a benchmark all drive it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+from client.frames import Frame
+from client.timing import Stamps
+from client.upscaler import OnnxUpscaler, State
+from client.video import Decoded
+
+
+class Sink(Protocol):
+    def write(self, frame: Frame) -> None:
+        """Take one picture; whatever is kept of it is copied."""
+
+
+class Restart(Enum):
+    """Why the network's memory began anew at a frame."""
+
+    SIZE = "the picture changed size"
+    DAMAGE = "the stream was damaged, or whole again"
+    LOST = "the state was not finite"
+
+
+@dataclass(frozen=True, slots=True)
+class FrameDone:
+    """One frame that went the whole way: as it was decoded, as it came out, when, and whether the state was restarted for it."""
+
+    pts: int | None
+    stamps: Stamps
+    decoded: Frame
+    picture: Frame
+    restart: Restart | None
+
+
+def upscale_stream(source: Iterable[Decoded], upscaler: OnnxUpscaler, sink: Sink) -> Iterator[FrameDone]:
+    """Upscale every frame of `source` in order into `sink`, one at a time, the state carried from frame to frame.
+
+    The state starts from zeros with the stream, and again where the picture changes size, where damage begins and where it
+    ends, and where the state is lost. What the caller does between two frames is in no stage's time. Raises what source,
+    upscaler and sink raise.
+    """
+    state: State | None = None
+    damaged = False
+    for item in source:
+        frame, restart = item.frame, None
+        if state is None:
+            state = upscaler.initial_state(frame.height, frame.width)
+        elif (frame.height, frame.width) != (state.height, state.width):
+            state, restart = upscaler.initial_state(frame.height, frame.width), Restart.SIZE
+        elif frame.damaged != damaged:
+            state, restart = upscaler.initial_state(frame.height, frame.width), Restart.DAMAGE
+        damaged = frame.damaged
+        picture, state = upscaler.step(frame, state)
+        upscaled_ns = time.perf_counter_ns()
+        if state.restarted:
+            restart = Restart.LOST
+        sink.write(picture)
+        stamps = Stamps(item.packet_ns, item.decoded_ns, upscaled_ns, time.perf_counter_ns())
+        yield FrameDone(frame.pts, stamps, frame, picture, restart)

@@ -1,0 +1,175 @@
+"""One frame and the state in, one upscaled frame and the next state out: an artifact run by ONNX Runtime."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+
+from client.artifact import ModelSpec, load_session
+from client.cores import physical_cores
+from client.errors import InputError, ModelError
+from client.frames import Frame, Plane
+
+MAX_OUTPUT_PIXELS = 64 * 2**20
+
+
+class State:
+    """What the network remembers of one stream, with the buffers that its next frame is computed in.
+
+    Made by `OnnxUpscaler.initial_state` for frames of `height` x `width`. `OnnxUpscaler.step` consumes it and returns the
+    next one in its place; the two alternate between two sets of tensors, so nothing is allocated per frame for the state.
+    `restarted` says that the step which returned it found its state lost and began again from zeros.
+    """
+
+    __slots__ = ("_buffers", "_consumed", "_current", "height", "restarted", "width")
+
+    def __init__(self, buffers: _StreamBuffers, current: int, restarted: bool) -> None:
+        self.height, self.width = buffers.height, buffers.width
+        self.restarted = restarted
+        self._buffers = buffers
+        self._current = current
+        self._consumed = False
+
+    def copy(self) -> State:
+        """A state of its own with the same content, that outlives the step which consumes this one."""
+        self._check()
+        return State(self._buffers.copy(self._current), 0, self.restarted)
+
+    def _take(self) -> tuple[_StreamBuffers, int]:
+        self._check()
+        self._consumed = True
+        return self._buffers, self._current
+
+    def _check(self) -> None:
+        if self._consumed:
+            raise ValueError("this state was consumed by an earlier step: pass on the one it returned, or keep a copy()")
+
+
+class OnnxUpscaler:
+    """A self-describing artifact in ONNX Runtime; every network and every baseline looks the same from here.
+
+    `provider` is cpu, cuda or openvino; `threads` is the number of threads of one operator, by default the physical cores
+    available to the process. One upscaler serves any number of streams, one step at a time. Raises ModelError for a file
+    that is not an artifact of ours and ProviderError for a provider that is not installed or does not start.
+    """
+
+    def __init__(self, model: Path, *, provider: str = "cpu", threads: int | None = None) -> None:
+        self.provider = provider
+        self.threads = threads or physical_cores()
+        self._session, self.spec = load_session(model, provider, self.threads)
+        self._device = "cuda" if provider == "cuda" else "cpu"
+
+    def initial_state(self, height: int, width: int) -> State:
+        """An empty memory for frames of `height` x `width` pixels; raises InputError when the result would be too large."""
+        scale = self.spec.scale
+        if height * width * scale * scale > MAX_OUTPUT_PIXELS:
+            raise InputError(
+                f"{width}x{height} upscaled by {scale} is more than {MAX_OUTPUT_PIXELS // 2**20} megapixels: use a smaller video or scale"
+            )
+        return State(_StreamBuffers(self._session, self.spec, self._device, height, width), 0, restarted=False)
+
+    def step(self, frame: Frame, state: State) -> tuple[Frame, State]:
+        """Upscale one frame.
+
+        `frame` has the size that `state` was made for. The picture returned is `scale` times as high and as wide (an odd
+        size stays odd), carries the frame's pts, time_base, colour and damaged, and is valid for as long as it is held:
+        its planes are new arrays. `state` is consumed. A state that came out not finite is lost: the frame is computed
+        again from zeros and the state returned says `restarted`.
+
+        Raises ValueError for a consumed state or one of another size, ModelError when the model fails on the frame.
+        """
+        if (frame.height, frame.width) != (state.height, state.width):
+            raise ValueError(f"a {frame.width}x{frame.height} frame for a state of {state.width}x{state.height}")
+        buffers, current = state._take()
+        buffers.load(frame)
+        planes, state_sum = buffers.run(current)
+        restarted = not np.isfinite(state_sum)
+        if restarted:
+            buffers.clear(current)
+            planes, state_sum = buffers.run(current)
+            if not np.isfinite(state_sum):
+                raise ModelError(f"model {self.spec.name} loses its state even when it starts from zeros: the file is damaged")
+        picture = replace(frame, y=planes[0], u=planes[1], v=planes[2])
+        return picture, State(buffers, 1 - current, restarted)
+
+    def warm_up(self, height: int, width: int) -> None:
+        """Run a few grey frames, so that the first real one does not pay for allocation and first use."""
+        grey = [np.full(shape, 128, np.uint8) for shape in _plane_shapes(height, width)]
+        state = self.initial_state(height, width)
+        for _ in range(3):
+            _, state = self.step(Frame(grey[0], grey[1], grey[2]), state)
+
+
+class _StreamBuffers:
+    """The tensors of one stream: input planes, two sets of state tensors, and the two bindings that alternate between them."""
+
+    def __init__(self, session: ort.InferenceSession, spec: ModelSpec, device: str, height: int, width: int) -> None:
+        self.height, self.width = height, width
+        self._session, self._spec, self._device = session, spec, device
+        multiple = spec.size_multiple
+        self._padded = -(-height // multiple) * multiple, -(-width // multiple) * multiple
+        self._inputs = [np.empty((1, 1, *shape), np.uint8) for shape in _plane_shapes(*self._padded)]
+        self._input_tensors = [ort.OrtValue.ortvalue_from_numpy(array) for array in self._inputs]
+        self._states = [[self._upload(zeros) for zeros in self._zeros()] for _ in range(2)]
+        self._state_sum = np.zeros((), np.float32)
+        self._bindings = [self._bind(current) for current in range(2)]
+
+    def load(self, frame: Frame) -> None:
+        """Copy the planes in, replicating the last row and column where the size does not fit the model."""
+        for buffer, plane in zip(self._inputs, (frame.y, frame.u, frame.v), strict=True):
+            target, (height, width) = buffer[0, 0], plane.shape
+            target[:height, :width] = plane
+            target[:height, width:] = target[:height, width - 1 : width]
+            target[height:] = target[height - 1]
+
+    def run(self, current: int) -> tuple[list[Plane], float]:
+        """Compute from state set `current` into the other; the planes are new arrays, cropped to the scaled size."""
+        scale = self._spec.scale
+        outputs = [np.empty((1, 1, *shape), np.uint8) for shape in _plane_shapes(self._padded[0] * scale, self._padded[1] * scale)]
+        binding = self._bindings[current]
+        for name, tensor in zip(("y", "u", "v"), self._input_tensors, strict=True):
+            binding.bind_ortvalue_input(name, tensor)  # for every frame: where the device has its own memory, binding is what copies
+        for name, array in zip(("y_up", "u_up", "v_up"), outputs, strict=True):
+            binding.bind_ortvalue_output(name, ort.OrtValue.ortvalue_from_numpy(array))
+        try:
+            self._session.run_with_iobinding(binding)
+        except Exception as error:  # the runtime's exceptions have no common base
+            reason = str(error).strip().splitlines()[0]
+            raise ModelError(f"model {self._spec.name} failed on a {self.width}x{self.height} frame: {reason}") from error
+        shapes = _plane_shapes(self.height * scale, self.width * scale)
+        return [array[0, 0, :height, :width] for array, (height, width) in zip(outputs, shapes, strict=True)], float(self._state_sum)
+
+    def clear(self, current: int) -> None:
+        for tensor, zeros in zip(self._states[current], self._zeros(), strict=True):
+            tensor.update_inplace(zeros)
+
+    def copy(self, current: int) -> _StreamBuffers:
+        """Buffers of their own, whose state set 0 is this one's set `current`."""
+        twin = _StreamBuffers(self._session, self._spec, self._device, self.height, self.width)
+        for target, source in zip(twin._states[0], self._states[current], strict=True):
+            target.update_inplace(source.numpy())
+        return twin
+
+    def _zeros(self) -> list[np.ndarray]:
+        height, width = self._padded
+        return [np.zeros((1, s.channels, height // s.divisor, width // s.divisor), s.dtype) for s in self._spec.state]
+
+    def _upload(self, array: np.ndarray) -> ort.OrtValue:
+        return ort.OrtValue.ortvalue_from_numpy(array, self._device, 0)
+
+    def _bind(self, current: int) -> ort.IOBinding:
+        binding = self._session.io_binding()
+        for spec, before, after in zip(self._spec.state, self._states[current], self._states[1 - current], strict=True):
+            binding.bind_ortvalue_input(spec.input, before)
+            binding.bind_ortvalue_output(spec.output, after)
+        if self._spec.state:
+            binding.bind_ortvalue_output("state_sum", ort.OrtValue.ortvalue_from_numpy(self._state_sum))
+        return binding
+
+
+def _plane_shapes(height: int, width: int) -> tuple[tuple[int, int], tuple[int, int], tuple[int, int]]:
+    chroma = (-(-height // 2), -(-width // 2))
+    return (height, width), chroma, chroma

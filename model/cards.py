@@ -1,0 +1,67 @@
+"""The model card: where an artifact's weights come from, as data inside the artifact and as a page beside it."""
+
+from __future__ import annotations
+
+from dataclasses import MISSING, fields
+from typing import Any
+
+from model.train import TrainConfig
+
+Card = dict[str, Any]
+
+
+def training_card(checkpoint: dict[str, Any]) -> Card:
+    """What a checkpoint knows of its own making, ready for JSON."""
+    config = TrainConfig(**checkpoint["config"])
+    return {
+        "command": training_command(config),
+        "commit": checkpoint["commit"],
+        "device": checkpoint["device"] + (", bfloat16" if config.bfloat16 else ""),
+        "steps": checkpoint["step"],
+        "training_seconds": round(checkpoint["seconds"]),
+        "footage": checkpoint["footage"],
+        "held_out": checkpoint["held_out"],
+    }
+
+
+def training_command(config: TrainConfig) -> str:
+    """The command that makes a run of this configuration; what is left out is the default."""
+    words = ["gamesr-train", "FOOTAGE.toml", "RUN"]
+    for field in fields(TrainConfig):
+        value = getattr(config, field.name)
+        if value == field.default or field.default is MISSING:
+            continue
+        words.append("--" + field.name.replace("_", "-"))
+        if value is not True:
+            words += [str(v) for v in value] if isinstance(value, (tuple, list)) else [str(value)]
+    return " ".join(words)
+
+
+def card_page(name: str, scale: int, card: Card) -> str:
+    """The card as Markdown."""
+    hours = card["training_seconds"] / 3600
+    lines = [
+        f"# {name} x{scale}",
+        "",
+        f"{card['parameters']:,} parameters ({card['parameters_in_training']:,} in training), float32.",
+        "",
+        f"- Command: `{card['command']}`",
+        f"- Commit: {card['commit']}",
+        f"- Steps: {card['steps']:,} in {hours:.2f} h of training time on {card['device']}",
+        f"- Trained on: {', '.join(card['footage']['train'])}",
+        f"- Held out while training: {', '.join(card['footage']['validate'])}",
+        "",
+        "The first frames of the held-out scenes, PSNR-Y in dB:",
+        "",
+        "| scene and input | bicubic | this model | gain |",
+        "|---|---|---|---|",
+    ]
+    for title, row in card["held_out"].items():
+        gain = row["psnr_y_db"] - row["bicubic_db"]
+        lines.append(f"| {title} | {row['bicubic_db']:.2f} | {row['psnr_y_db']:.2f} | {gain:+.2f} |")
+    lines += [
+        "",
+        "An input `area` is the reference downscaled by area, `area@4000` the same through x264 at 4000 kbps (zerolatency).",
+        "OpenArena's data is GPL-2+; SuperTuxKart's is under CC-BY-SA, CC-BY, CC0 and GPL.",
+    ]
+    return "\n".join(lines) + "\n"

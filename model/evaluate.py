@@ -1,0 +1,120 @@
+"""The table of test scenes: every artifact on every degraded clip, measured against the reference, one row at a time."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from client.errors import InputError
+from client.models import find_model
+from client.pipeline import upscale_stream
+from client.quality import QualityMeter
+from client.sink import NullSink
+from client.timing import stage_latencies
+from client.upscaler import OnnxUpscaler
+from client.video import Decoded
+from model.footage import Degradation, FootageCache, Pair, Scene, load_pairs
+
+Row = dict[str, Any]
+
+
+def evaluate(
+    scenes: Sequence[Scene],
+    cache: FootageCache,
+    *,
+    models: Sequence[str],
+    scales: Sequence[int],
+    degradations: Sequence[Degradation],
+    frames: int,
+    threads: int | None,
+    store: Path,
+) -> Iterator[Row]:
+    """Every combination as a row of figures; rows already in `store` (JSON lines) are read from it, new ones appended.
+
+    A row is known by scene, input, scale, number of frames and the artifact's digest. A model that does not come in a
+    scale is left out there. Raises what reading footage and models raises.
+    """
+    known = _read_rows(store)
+    for scale in scales:
+        upscalers = [OnnxUpscaler(path, threads=threads) for path in _artifacts(models, scale)]
+        for takes in load_pairs(scenes, cache, scale, degradations):
+            for pair in takes:
+                for upscaler in upscalers:
+                    spec = upscaler.spec
+                    key = {"clip": pair.title, "scale": scale, "model": spec.name, "sha256": spec.sha256, "frames": min(frames, len(pair))}
+                    row = known.get(json.dumps(key))
+                    if row is None:
+                        row = {**key, **_measure(pair, upscaler, frames)}
+                        with store.open("a") as file:
+                            file.write(json.dumps(row) + "\n")
+                    yield row
+
+
+def _artifacts(models: Iterable[str], scale: int) -> list[Path]:
+    return [find_model(name, scale) for name in models]
+
+
+def _measure(pair: Pair, upscaler: OnnxUpscaler, frames: int) -> Row:
+    upscaler.warm_up(pair.low.height, pair.low.width)
+    with QualityMeter(pair.high.width, pair.high.height) as meter:
+        stamps = []
+        for index, done in enumerate(upscale_stream(_decoded(pair, frames), upscaler, NullSink())):
+            stamps.append(done.stamps)
+            meter.add(pair.high.frame(index), done.picture)
+        quality = meter.result().record()
+    return {**quality, "upscale_us": stage_latencies(stamps)["upscale"].record()}
+
+
+def _decoded(pair: Pair, frames: int) -> Iterator[Decoded]:
+    for index in range(min(frames, len(pair))):
+        now = time.perf_counter_ns()
+        yield Decoded(pair.low.frame(index), now, now)
+
+
+def _read_rows(store: Path) -> dict[str, Row]:
+    rows: dict[str, Row] = {}
+    if store.exists():
+        for line in store.read_text().splitlines():
+            try:
+                row = json.loads(line)
+                rows[json.dumps({k: row[k] for k in ("clip", "scale", "model", "sha256", "frames")})] = row
+            except (ValueError, KeyError) as error:
+                raise InputError(f"{store} is not a file of rows made by gamesr-evaluate: {error}") from error
+    return rows
+
+
+def table(rows: Iterable[Row]) -> str:
+    """Markdown: a line for each game, scale, input and model, figures averaged over the game's scenes."""
+    groups: dict[tuple[str, int, str, str], list[Row]] = {}
+    for row in rows:
+        title, degradation = row["clip"].split()
+        groups.setdefault((title.split("/")[0], row["scale"], degradation, row["model"]), []).append(row)
+    lines = [
+        "| game | scale | input | model | PSNR-Y | PSNR-U | PSNR-V | SSIM-Y | VMAF | VMAF-NEG | temporal error | ms |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for (game, scale, degradation, model), group in groups.items():
+        cells = [_mean(group, name, digits) for name, digits in _COLUMNS]
+        milliseconds = fmean(row["upscale_us"]["p50"] for row in group) / 1000
+        lines.append(f"| {game} | x{scale} | {degradation} | {model} | {' | '.join(cells)} | {milliseconds:.0f} |")
+    return "\n".join(lines)
+
+
+_COLUMNS = (
+    ("psnr_y_db", 2),
+    ("psnr_u_db", 2),
+    ("psnr_v_db", 2),
+    ("ssim_y", 4),
+    ("vmaf", 1),
+    ("vmaf_neg", 1),
+    ("temporal_error", 2),
+)
+
+
+def _mean(rows: Sequence[Row], name: str, digits: int) -> str:
+    values = [row[name] for row in rows]
+    return "undefined" if None in values else f"{fmean(values):.{digits}f}"

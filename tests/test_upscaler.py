@@ -1,0 +1,306 @@
+"""An artifact run frame by frame: the state's rules, sizes that do not fit, and files that are refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+import pytest
+from onnx import TensorProto, helper
+
+from client.artifact import MAX_FILE_BYTES
+from client.cores import physical_cores
+from client.errors import InputError, ModelError, ProviderError
+from client.frames import ColourTags, Frame
+from client.models import find_model, shipped_models
+from client.upscaler import OnnxUpscaler, State
+from tests.conftest import tiny_model
+
+ModelFile = Callable[..., Path]
+
+
+def noise(seed: int, height: int = 10, width: int = 14) -> Frame:
+    rng = np.random.default_rng(seed)
+    chroma = (-(-height // 2), -(-width // 2))
+    y, u, v = (rng.integers(0, 256, shape, dtype=np.uint8) for shape in ((height, width), chroma, chroma))
+    return Frame(y, u, v, seed, Fraction(1, 30))
+
+
+def same(a: Frame, b: Frame) -> bool:
+    return all(np.array_equal(p, q) for p, q in zip((a.y, a.u, a.v), (b.y, b.u, b.v), strict=True))
+
+
+def run(upscaler: OnnxUpscaler, frames: list[Frame], state: State | None = None) -> list[Frame]:
+    state = state or upscaler.initial_state(frames[0].height, frames[0].width)
+    pictures = []
+    for frame in frames:
+        picture, state = upscaler.step(frame, state)
+        pictures.append(picture)
+    return pictures
+
+
+def tiny_in_numpy(frames: list[Frame], scale: int) -> list[Frame]:
+    """What the tiny artifact computes, written down a second time."""
+    state, pictures = np.zeros(()), []
+    for frame in frames:
+        height, width = frame.y.shape
+        mean = frame.y.astype(np.float32).reshape(height // 2, 2, width // 2, 2).mean((1, 3))
+        state = 0.5 * state + mean
+        big = frame.y.repeat(scale, 0).repeat(scale, 1)
+        memory = state.repeat(2 * scale, 0).repeat(2 * scale, 1)
+        luma = np.clip(0.875 * big + 0.125 * memory, 0, 255).astype(np.uint8)
+        pictures.append(Frame(luma, *(plane.repeat(scale, 0).repeat(scale, 1) for plane in (frame.u, frame.v))))
+    return pictures
+
+
+@pytest.mark.parametrize("scale", [2, 3])
+def test_steps_compute_what_the_artifact_says(model_file: ModelFile, scale: int) -> None:
+    frames = [noise(seed) for seed in range(5)]
+    pictures = run(OnnxUpscaler(model_file(scale=scale)), frames)
+    assert all(same(got, expected) for got, expected in zip(pictures, tiny_in_numpy(frames, scale), strict=True))
+
+
+def test_picture_carries_what_the_frame_carried(model_file: ModelFile) -> None:
+    frame = Frame(*(np.zeros(s, np.uint8) for s in ((4, 6), (2, 3), (2, 3))), 77, Fraction(1, 90000), ColourTags(2, 5, 6, 5), damaged=True)
+    upscaler = OnnxUpscaler(model_file())
+    picture, _ = upscaler.step(frame, upscaler.initial_state(4, 6))
+    assert (picture.pts, picture.time_base, picture.colour, picture.damaged) == (77, Fraction(1, 90000), ColourTags(2, 5, 6, 5), True)
+
+
+def test_the_state_matters_and_is_carried(model_file: ModelFile) -> None:
+    upscaler = OnnxUpscaler(model_file())
+    first, second = run(upscaler, [noise(0), noise(0)])
+    assert not np.array_equal(first.y, second.y)
+
+
+def test_a_clip_gives_the_same_pictures_every_time(model_file: ModelFile) -> None:
+    frames = [noise(seed) for seed in range(4)]
+    upscaler = OnnxUpscaler(model_file())
+    assert all(same(a, b) for a, b in zip(run(upscaler, frames), run(upscaler, frames), strict=True))
+
+
+def test_a_consumed_state_is_refused(model_file: ModelFile) -> None:
+    upscaler = OnnxUpscaler(model_file())
+    state = upscaler.initial_state(10, 14)
+    upscaler.step(noise(0), state)
+    with pytest.raises(ValueError, match="consumed"):
+        upscaler.step(noise(1), state)
+    with pytest.raises(ValueError, match="consumed"):
+        state.copy()
+
+
+def test_a_copy_goes_on_from_where_it_was_taken(model_file: ModelFile) -> None:
+    upscaler = OnnxUpscaler(model_file())
+    _, state = upscaler.step(noise(0), upscaler.initial_state(10, 14))
+    kept = state.copy()
+    tail = [noise(seed) for seed in range(1, 4)]
+    assert all(same(a, b) for a, b in zip(run(upscaler, tail, state), run(upscaler, tail, kept), strict=True))
+
+
+def test_streams_on_one_upscaler_do_not_mix(model_file: ModelFile) -> None:
+    upscaler = OnnxUpscaler(model_file())
+    ours, theirs = [noise(seed) for seed in range(4)], [noise(seed) for seed in range(10, 14)]
+    alone = run(upscaler, ours)
+    a, b = upscaler.initial_state(10, 14), upscaler.initial_state(10, 14)
+    for frame, other, expected in zip(ours, theirs, alone, strict=True):
+        picture, a = upscaler.step(frame, a)
+        _, b = upscaler.step(other, b)
+        assert same(picture, expected)
+
+
+def test_a_picture_is_valid_for_as_long_as_it_is_held(model_file: ModelFile) -> None:
+    upscaler = OnnxUpscaler(model_file())
+    frames = [noise(seed) for seed in range(6)]
+    pictures = run(upscaler, frames)
+    assert all(same(a, b) for a, b in zip(pictures, tiny_in_numpy(frames, 2), strict=True))
+
+
+def test_rows_may_lie_apart(model_file: ModelFile) -> None:
+    upscaler = OnnxUpscaler(model_file())
+    frame = noise(0)
+    wide = [np.pad(plane, ((0, 3), (0, 50)))[: plane.shape[0], : plane.shape[1]] for plane in (frame.y, frame.u, frame.v)]
+    assert all(plane.strides[0] > plane.shape[1] for plane in wide)
+    assert same(run(upscaler, [Frame(*wide)])[0], run(upscaler, [frame])[0])
+
+
+@pytest.mark.parametrize(("height", "width"), [(9, 13), (9, 14), (10, 13), (2, 2), (1, 1)])
+@pytest.mark.parametrize("multiple", [2, 4])
+def test_a_size_that_does_not_fit_is_padded_by_its_edge_and_cropped(model_file: ModelFile, height: int, width: int, multiple: int) -> None:
+    upscaler = OnnxUpscaler(model_file(metadata={"size_multiple": str(multiple)}))
+    frames = [noise(seed, height, width) for seed in range(3)]
+    high, wide = -height % multiple, -width % multiple
+    padded = []
+    for frame in frames:
+        rows, columns = (height + high) // 2 - frame.u.shape[0], (width + wide) // 2 - frame.u.shape[1]
+        chroma = (np.pad(plane, ((0, rows), (0, columns)), mode="edge") for plane in (frame.u, frame.v))
+        padded.append(Frame(np.pad(frame.y, ((0, high), (0, wide)), mode="edge"), *chroma))
+    for got, whole in zip(run(upscaler, frames), run(upscaler, padded), strict=True):
+        assert (got.y.shape, got.u.shape) == ((2 * height, 2 * width), (height, width))
+        assert same(got, Frame(whole.y[: 2 * height, : 2 * width], whole.u[:height, :width], whole.v[:height, :width]))
+
+
+def test_an_odd_result_keeps_its_size(model_file: ModelFile) -> None:
+    (picture,) = run(OnnxUpscaler(model_file(scale=3)), [noise(0, 5, 7)])
+    assert (picture.y.shape, picture.u.shape, picture.v.shape) == ((15, 21), (8, 11), (8, 11))
+
+
+def test_a_lost_state_starts_again_from_zeros(model_file: ModelFile) -> None:
+    """With a gain of 1e30 the state overflows at every third frame; that frame must look like a first one."""
+    upscaler = OnnxUpscaler(model_file(gain=1e30))
+    frames = [noise(seed) for seed in range(6)]
+    state, restarted = upscaler.initial_state(10, 14), []
+    for index, frame in enumerate(frames):
+        picture, state = upscaler.step(frame, state)
+        restarted.append(state.restarted)
+        if state.restarted:
+            assert same(picture, run(upscaler, [frame])[0]), index
+    assert restarted == [False, False, True, False, True, False]
+
+
+def test_a_model_that_always_loses_its_state_is_refused(model_file: ModelFile) -> None:
+    upscaler = OnnxUpscaler(model_file(gain=float("nan")))
+    with pytest.raises(ModelError, match="loses its state"):
+        run(upscaler, [noise(0)])
+
+
+def test_a_frame_of_another_size_than_its_state_is_refused(model_file: ModelFile) -> None:
+    upscaler = OnnxUpscaler(model_file())
+    with pytest.raises(ValueError, match="12x10 frame for a state of 14x10"):
+        upscaler.step(noise(0, 10, 12), upscaler.initial_state(10, 14))
+
+
+def test_a_result_beyond_reason_is_refused(model_file: ModelFile) -> None:
+    with pytest.raises(InputError, match="megapixels"):
+        OnnxUpscaler(model_file()).initial_state(8192, 4096)
+
+
+def test_a_stateless_artifact_runs_the_same_way(model_file: ModelFile) -> None:
+    upscaler = OnnxUpscaler(model_file(stateful=False))
+    (picture,) = run(upscaler, [noise(0)])
+    assert upscaler.spec.state == () and np.array_equal(picture.y, noise(0).y.repeat(2, 0).repeat(2, 1))
+
+
+def test_spec_is_what_the_file_says(model_file: ModelFile) -> None:
+    path = model_file()
+    spec = OnnxUpscaler(path).spec
+    assert (spec.name, spec.scale, spec.size_multiple, spec.precision, spec.card) == ("tiny", 2, 2, "float32", {"footage": "none"})
+    assert [(s.input, s.output, s.channels, s.divisor, s.dtype) for s in spec.state] == [("h_in", "h_out", 1, 2, "float32")]
+    assert spec.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def state_entry(**changes: object) -> str:
+    return json.dumps([{"input": "h_in", "output": "h_out", "channels": 1, "divisor": 2, "dtype": "float32", **changes}])
+
+
+@pytest.mark.parametrize(
+    ("metadata", "reason"),
+    [
+        ({"gamesr_format": None}, "does not say gamesr_format"),
+        ({"gamesr_format": "2"}, "its format is '2'"),
+        ({"scale": "two"}, "metadata is incomplete or wrong"),
+        ({"scale": "4"}, "its scale is 4"),
+        ({"name": None}, "metadata is incomplete or wrong"),
+        ({"name": "\x1b[31m"}, "not a short word"),
+        ({"size_multiple": "3"}, "its size multiple is 3"),
+        ({"state": "[]"}, "its inputs are"),
+        ({"state": "not json"}, "metadata is incomplete or wrong"),
+        ({"state": '[{"input": "h_in"}]'}, "metadata is incomplete or wrong"),
+        ({"state": state_entry(dtype="int8")}, "its state h_in is int8"),
+        ({"state": state_entry(dtype="float16")}, "its inputs are"),
+        ({"state": state_entry(channels=10**9)}, "has 1000000000 channels"),
+        ({"state": state_entry(divisor=0)}, "at 1/0 of the size"),
+        ({"state": state_entry(channels="1")}, "has 1 channels"),
+        ({"card": "[1]"}, "metadata is incomplete or wrong"),
+    ],
+)
+def test_metadata_that_is_not_understood_is_refused(model_file: ModelFile, metadata: dict[str, str | None], reason: str) -> None:
+    with pytest.raises(ModelError, match="not a model that this client understands") as error:
+        OnnxUpscaler(model_file(metadata=metadata))
+    assert reason in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_model_whose_state_has_another_shape_fails_in_one_sentence(model_file: ModelFile) -> None:
+    upscaler = OnnxUpscaler(model_file(metadata={"state": state_entry(channels=3)}))
+    with pytest.raises(ModelError, match="model tiny failed on a 14x10 frame") as error:
+        run(upscaler, [noise(0)])
+    assert "\n" not in str(error.value)
+
+
+def test_a_model_that_lies_about_its_scale_fails_in_one_sentence(model_file: ModelFile) -> None:
+    with pytest.raises(ModelError, match="model tiny failed on a 14x10 frame"):
+        run(OnnxUpscaler(model_file(metadata={"scale": "3"})), [noise(0)])
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "text", "noise"])
+def test_a_damaged_or_foreign_file_is_refused(model_file: ModelFile, tmp_path: Path, damage: str) -> None:
+    whole = model_file().read_bytes()
+    content = {
+        "cut": whole[: len(whole) // 2],
+        "empty": b"",
+        "text": b"#!/bin/sh\necho a model\n",
+        "noise": np.random.default_rng(0).bytes(2000),
+    }[damage]
+    path = tmp_path / "broken.onnx"
+    path.write_bytes(content)
+    with pytest.raises(ModelError, match=r"broken\.onnx is not a") as error:
+        OnnxUpscaler(path)
+    assert "\n" not in str(error.value)
+
+
+def test_files_that_cannot_be_models_are_refused(tmp_path: Path) -> None:
+    with (tmp_path / "huge.onnx").open("wb") as file:
+        file.truncate(MAX_FILE_BYTES + 1)
+    with pytest.raises(ModelError, match="larger than 64 MiB"):
+        OnnxUpscaler(tmp_path / "huge.onnx")
+    with pytest.raises(ModelError, match="cannot be read"):
+        OnnxUpscaler(tmp_path)
+
+
+def test_a_model_cannot_make_the_runtime_read_other_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.ones(4, np.float32).tofile("weights.bin")
+    model = tiny_model()
+    outside = TensorProto(name="outside", data_type=TensorProto.FLOAT, dims=[4], data_location=TensorProto.EXTERNAL)
+    outside.external_data.add(key="location", value="weights.bin")
+    model.graph.initializer.append(outside)
+    model.graph.output.append(helper.make_tensor_value_info("leak", TensorProto.FLOAT, [4]))
+    model.graph.node.append(helper.make_node("Identity", ["outside"], ["leak"]))
+    Path("leaky.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(ModelError, match="not a readable ONNX model"):
+        OnnxUpscaler(Path("leaky.onnx"))
+
+
+def test_a_missing_provider_names_what_to_install(model_file: ModelFile, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ort, "get_available_providers", lambda: ["CPUExecutionProvider"])
+    with pytest.raises(ProviderError, match=r"pip install 'gamesr\[cuda\]'"):
+        OnnxUpscaler(model_file(), provider="cuda")
+    with pytest.raises(ProviderError, match="no provider 'tpu'"):
+        OnnxUpscaler(model_file(), provider="tpu")
+
+
+def test_threads_are_the_physical_cores_unless_said(model_file: ModelFile) -> None:
+    path = model_file()
+    assert OnnxUpscaler(path).threads == physical_cores() >= 1
+    assert OnnxUpscaler(path, threads=1).threads == 1
+
+
+def test_every_shipped_model_is_understood_and_named_after_itself() -> None:
+    models = shipped_models()
+    assert {"bicubic_x2", "bicubic_x3", "lanczos_x2", "lanczos_x3"} <= {path.stem for path in models}
+    for path in models:
+        spec = OnnxUpscaler(path, threads=1).spec
+        assert path.stem == f"{spec.name}_x{spec.scale}"
+        assert find_model(spec.name, spec.scale) == path
+
+
+def test_models_are_found_by_name_or_path(model_file: ModelFile) -> None:
+    path = model_file()
+    assert find_model(str(path), 2) == path
+    with pytest.raises(ModelError, match=r"no model named 'bicubik' ships for scale 2 \(there is .*bicubic_x2"):
+        find_model("bicubik", 2)
+    assert find_model("nowhere/bicubic", 2) == Path("nowhere/bicubic")
