@@ -84,8 +84,8 @@ class Degradation:
 
     @classmethod
     def parse(cls, text: str) -> Degradation:
-        source, _, bitrate = text.partition("@")
-        if source not in ("area", "native") or (bitrate and not (bitrate.isdigit() and int(bitrate))):
+        source, at, bitrate = text.partition("@")
+        if source not in ("area", "native") or (at and not (bitrate.isdigit() and int(bitrate))):
             raise InputError(f"{text!r} is not a degradation: write area, native, area@4000 or native@4000 (kbps)")
         return cls(source, int(bitrate) if bitrate else None)
 
@@ -164,7 +164,7 @@ class FootageCache:
             partial = path.with_suffix(f".{os.getpid()}.npy")
             np.save(partial, np.stack(rows))
             partial.replace(path)
-        return Take(np.load(path, mmap_mode="r"))
+        return Take(np.load(path, mmap_mode="c"))  # torch warns of arrays that it could not write to
 
 
 def _digest(path: Path) -> str:

@@ -76,7 +76,7 @@ def charbonnier(output: Planes, target: Planes, eps: float) -> Tensor:
 
 def to_planes(arrays: list[np.ndarray], device: torch.device) -> Planes:
     """uint8 arrays [y, u, v] as float planes of code values."""
-    return Planes(*(torch.from_numpy(np.require(a, requirements="W")).to(device, torch.float32) for a in arrays))
+    return Planes(*(torch.from_numpy(a).to(device, torch.float32) for a in arrays))
 
 
 class Trainer:

@@ -1,0 +1,168 @@
+"""Training: footage lists, degradation, sampling, and a run that resumes to the same weights."""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import torch
+
+from client.cloud import CloudEncoder, CloudSettings, area_downscale, through_codec
+from client.errors import InputError, ModelError
+from client.frames import Frame
+from client.video import to_av_frame
+from model.cli import train_main
+from model.footage import Degradation, FootageCache, by_game, load_pairs, load_scenes, sample_clips
+from model.train import TrainConfig, Trainer, load_checkpoint, network_of
+
+
+def picture(t: int, height: int = 96, width: int = 128) -> Frame:
+    """A texture that moves two pixels a frame."""
+    rows, columns = np.mgrid[:height, :width]
+    luma = 128 + 60 * np.sin((columns + 2 * t) / 3) * np.cos(rows / 4)
+    chroma = np.full((height // 2, width // 2), 100 + t)
+    return Frame(luma.astype(np.uint8), chroma.astype(np.uint8), (chroma + 30).astype(np.uint8))
+
+
+@pytest.fixture(scope="module")
+def footage(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("footage")
+    with av.open(str(folder / "clip.mkv"), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"qp": "4", "preset": "ultrafast"})
+        stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv420p"
+        for t in range(12):
+            frame = to_av_frame(picture(t))
+            frame.pts, frame.time_base = t, Fraction(1, 30)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    scene = '[[scene]]\nname = "{}"\ngame = "{}"\nsplit = "{}"\nfps = 30\nreference = "clip.mkv"\n'
+    rows = [("one", "a", "train"), ("two", "b", "train"), ("three", "b", "train"), ("four", "a", "validate")]
+    (folder / "footage.toml").write_text("\n".join(scene.format(*row) for row in rows))
+    return folder / "footage.toml"
+
+
+TINY = TrainConfig(degradations=("area", "area@300"), steps=8, batch=2, patch=16, frames=4, window=2, warm_up_steps=2)
+
+
+def test_a_resumed_run_ends_at_the_same_weights(footage: Path, tmp_path: Path) -> None:
+    cache = FootageCache(tmp_path / "cache")
+    Trainer(TINY, footage, cache, tmp_path / "whole").run(validate_every=100, progress=False)
+    stopped = Trainer(TINY, footage, cache, tmp_path / "parts")
+    losses = stopped.losses()
+    for _ in range(4):
+        next(losses)
+    stopped.save()
+    Trainer(TINY, footage, cache, tmp_path / "parts").run(validate_every=100, progress=False)
+    whole, parts = (load_checkpoint(tmp_path / name / "checkpoint.pt") for name in ("whole", "parts"))
+    assert whole["step"] == parts["step"] == 8
+    for name, weight in whole["network"].items():
+        assert torch.equal(weight, parts["network"][name]), name
+
+
+def test_training_lowers_the_loss_and_another_seed_is_another_run(footage: Path, tmp_path: Path) -> None:
+    config = TrainConfig(degradations=("area",), steps=60, batch=2, patch=32, frames=4, window=2, warm_up_steps=5)
+    cache = FootageCache(tmp_path / "cache")
+    losses = list(Trainer(config, footage, cache, tmp_path / "a").losses())
+    assert np.mean(losses[-10:]) < 0.8 * np.mean(losses[:10])
+    other = Trainer(TrainConfig(**{**TINY.__dict__, "seed": 1}), footage, cache, tmp_path / "b")
+    assert next(other.losses()) != losses[0]
+
+
+def test_the_command_trains_logs_and_refuses_another_configuration(
+    footage: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    tiny = ["--steps", "4", "--batch", "2", "--patch", "16", "--frames", "4", "--window", "2", "--degradations", "area"]
+    command = [str(footage), str(run), "--cache", str(tmp_path / "cache"), *tiny]
+    assert train_main(command) == 0
+    row = json.loads((run / "log.jsonl").read_text().splitlines()[-1])
+    assert row["step"] == 4
+    assert set(row["held_out"]) == {"a/four area"}
+    assert train_main([*command, "--seed", "3"]) == 1
+    assert "another configuration (seed)" in capsys.readouterr().err
+    network_of(load_checkpoint(run / "checkpoint.pt"))
+
+
+def test_a_batch_is_a_function_of_seed_and_index(footage: Path, tmp_path: Path) -> None:
+    pairs = load_pairs(load_scenes(footage, split="train"), FootageCache(tmp_path), 2, [Degradation("area")])
+    games = by_game(pairs)
+    assert [len(scenes) for scenes in games] == [1, 2]
+    first, again, other = (sample_clips(games, seed=0, index=i, batch=3, frames=4, patch=16, scale=2) for i in (5, 5, 6))
+    assert [p.shape for p in first[0]] == [(3, 4, 1, 16, 16), (3, 4, 1, 8, 8), (3, 4, 1, 8, 8)]
+    assert [p.shape for p in first[1]] == [(3, 4, 1, 32, 32), (3, 4, 1, 16, 16), (3, 4, 1, 16, 16)]
+    assert all(np.array_equal(a, b) for a, b in zip(first[0] + first[1], again[0] + again[1], strict=True))
+    assert not np.array_equal(first[0][0], other[0][0])
+    # the crops of the two sizes show the same place: one is the other's area mean, to its rounding
+    mean = first[1][0].reshape(3, 4, 1, 16, 2, 16, 2).mean((4, 6))
+    assert np.abs(mean - first[0][0]).max() <= 0.5
+
+
+@pytest.mark.parametrize("scale", [2, 3])
+def test_area_downscale_keeps_means_and_the_place_of_chroma(scale: int) -> None:
+    frame = picture(0, 48, 96)
+    small = area_downscale(frame, scale)
+    expected = frame.y.reshape(48 // scale, scale, 96 // scale, scale).mean((1, 3))
+    assert np.abs(expected - small.y).max() <= 0.5
+    # on a ramp over chroma columns, output column j lies at input column scale * j + (scale - 1) / 4
+    ramp = np.tile(np.arange(0, 192, 4, dtype=np.uint8), (24, 1))
+    moved = area_downscale(Frame(frame.y, ramp, ramp), scale).u[:, 1:-1]
+    place = scale * np.arange(1, moved.shape[1] + 1) + (scale - 1) / 4
+    assert np.abs(moved - 4 * place).max() <= 0.5
+    with pytest.raises(ValueError, match="not a multiple"):
+        area_downscale(picture(0, 46, 96), 2 * scale)
+
+
+def test_the_codec_gives_every_frame_and_the_bitrate_decides_how_well() -> None:
+    frames = [picture(t) for t in range(10)]
+    errors = []
+    for bitrate_kbps in (50, 2000):
+        decoded = list(through_codec(frames, CloudSettings(bitrate_kbps, 30)))
+        assert len(decoded) == len(frames)
+        errors.append(np.mean([np.square(a.y.astype(float) - b.y).mean() for a, b in zip(frames, decoded, strict=True)]))
+    assert errors[0] > 4 * errors[1]
+
+
+def test_the_cloud_encoder_holds_nothing_back() -> None:
+    encoder = CloudEncoder(CloudSettings(500, 30), 128, 96)
+    assert [len(encoder.encode(picture(t))) for t in range(40)] == [1] * 40
+    assert encoder.flush() == []
+
+
+@pytest.mark.parametrize("text", ["box", "area@", "area@x", "native@0", "area@-1", ""])
+def test_an_unknown_degradation_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match="not a degradation"):
+        Degradation.parse(text)
+
+
+def test_a_degradation_is_read_as_it_is_written() -> None:
+    assert [str(Degradation.parse(text)) for text in ("area", "native@4000")] == ["area", "native@4000"]
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("scene = 3", "not a footage list"),
+        ("[[scene]]\nname='a'", "not a footage list"),
+        ("not toml", "not a footage list"),
+        (
+            '[[scene]]\nname="a"\ngame="g"\nsplit="train"\nfps=30\nreference="x"\n' * 2
+            + '[[scene]]\nname="a"\ngame="g"\nsplit="test"\nfps=30\nreference="x"',
+            "two splits",
+        ),
+        ('[[scene]]\nname="a"\ngame="g"\nsplit="test"\nfps=30\nreference="x"', "no train scene"),
+    ],
+)
+def test_a_bad_footage_list_is_refused(tmp_path: Path, content: str, reason: str) -> None:
+    (tmp_path / "footage.toml").write_text(content)
+    with pytest.raises(InputError, match=reason):
+        load_scenes(tmp_path / "footage.toml", split="train")
+
+
+def test_a_file_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "checkpoint.pt").write_bytes(b"nothing")
+    with pytest.raises(ModelError, match="not a checkpoint"):
+        load_checkpoint(tmp_path / "checkpoint.pt")
