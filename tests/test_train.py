@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-from fractions import Fraction
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 import torch
@@ -14,35 +12,15 @@ import torch
 from client.cloud import CloudEncoder, CloudSettings, area_downscale, through_codec
 from client.errors import InputError, ModelError
 from client.frames import Frame
-from client.video import to_av_frame
 from model.cli import train_main
 from model.footage import Degradation, FootageCache, by_game, load_pairs, load_scenes, sample_clips
 from model.train import TrainConfig, Trainer, load_checkpoint, network_of
-
-
-def picture(t: int, height: int = 96, width: int = 128) -> Frame:
-    """A texture that moves two pixels a frame."""
-    rows, columns = np.mgrid[:height, :width]
-    luma = 128 + 60 * np.sin((columns + 2 * t) / 3) * np.cos(rows / 4)
-    chroma = np.full((height // 2, width // 2), 100 + t)
-    return Frame(luma.astype(np.uint8), chroma.astype(np.uint8), (chroma + 30).astype(np.uint8))
+from tests.moving import picture, write_footage
 
 
 @pytest.fixture(scope="module")
 def footage(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("footage")
-    with av.open(str(folder / "clip.mkv"), "w") as container:
-        stream = container.add_stream("libx264", rate=30, options={"qp": "4", "preset": "ultrafast"})
-        stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv420p"
-        for t in range(12):
-            frame = to_av_frame(picture(t))
-            frame.pts, frame.time_base = t, Fraction(1, 30)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    scene = '[[scene]]\nname = "{}"\ngame = "{}"\nsplit = "{}"\nfps = 30\nreference = "clip.mkv"\n'
-    rows = [("one", "a", "train"), ("two", "b", "train"), ("three", "b", "train"), ("four", "a", "validate")]
-    (folder / "footage.toml").write_text("\n".join(scene.format(*row) for row in rows))
-    return folder / "footage.toml"
+    return write_footage(tmp_path_factory.mktemp("footage"))
 
 
 TINY = TrainConfig(degradations=("area", "area@300"), steps=8, batch=2, patch=16, frames=4, window=2, warm_up_steps=2)

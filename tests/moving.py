@@ -1,0 +1,36 @@
+"""A moving texture, as frames and as footage for training."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+
+from client.frames import Frame
+from client.video import to_av_frame
+
+
+def picture(t: int, height: int = 96, width: int = 128) -> Frame:
+    """A texture that moves two pixels a frame."""
+    rows, columns = np.mgrid[:height, :width]
+    luma = 128 + 60 * np.sin((columns + 2 * t) / 3) * np.cos(rows / 4)
+    chroma = np.full((height // 2, width // 2), 100 + t)
+    return Frame(luma.astype(np.uint8), chroma.astype(np.uint8), (chroma + 30).astype(np.uint8))
+
+
+def write_footage(folder: Path) -> Path:
+    """A footage list of four scenes of two games, all of them one clip of 12 frames, 128x96."""
+    with av.open(str(folder / "clip.mkv"), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"qp": "4", "preset": "ultrafast"})
+        stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv420p"
+        for t in range(12):
+            frame = to_av_frame(picture(t))
+            frame.pts, frame.time_base = t, Fraction(1, 30)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    scene = '[[scene]]\nname = "{}"\ngame = "{}"\nsplit = "{}"\nfps = 30\nreference = "clip.mkv"\n'
+    rows = [("one", "a", "train"), ("two", "b", "train"), ("three", "b", "train"), ("four", "a", "validate"), ("five", "a", "test")]
+    (folder / "footage.toml").write_text("\n".join(scene.format(*row) for row in rows))
+    return folder / "footage.toml"

@@ -1,0 +1,98 @@
+"""The workshop's commands one after the other, as their user runs them: train, export, verify, evaluate."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from client.upscaler import OnnxUpscaler
+from model.cli import evaluate_main, export_main, train_main, verify_main
+from tests.moving import write_footage
+
+TINY = ["--steps", "4", "--batch", "2", "--patch", "16", "--frames", "4", "--window", "2", "--degradations", "area"]
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("workshop")
+    footage = write_footage(folder)
+    assert train_main([str(footage), str(folder / "run"), "--cache", str(folder / "cache"), "--learning-rate", "0.002", *TINY]) == 0
+    assert export_main([str(folder / "run" / "checkpoint.pt"), "tiny", "--folder", str(folder)]) == 0
+    return folder
+
+
+def test_the_artifact_and_its_card_say_how_it_was_made(workshop: Path) -> None:
+    card = OnnxUpscaler(workshop / "tiny_x2.onnx", threads=1).spec.card
+    assert card["command"] == (
+        "gamesr-train FOOTAGE.toml RUN --degradations area --steps 4 --batch 2 --patch 16 --frames 4 --window 2 --learning-rate 0.002"
+    )
+    assert card["steps"] == 4
+    assert card["footage"]["train"] == ["a/one (12 frames)", "b/two (12 frames)", "b/three (12 frames)"]
+    page = (workshop / "tiny_x2.md").read_text()
+    assert card["command"] in page
+    assert "| a/four area | " in page
+
+
+def test_verify_holds_the_artifact_against_float64(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = [str(workshop / "tiny_x2.onnx"), str(workshop / "clip.mkv"), "--steps", "12", "--crop", "48x32"]
+    assert verify_main([*command, "--json"]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [row["step"] for row in rows] == list(range(1, 13))
+    assert max(row["max_code_error"] for row in rows) <= 1
+    assert verify_main(command) == 0
+    assert "step    12: picture within" in capsys.readouterr().out
+    assert verify_main([*command[:-1], "48x33"]) == 1
+    assert "not a size" in capsys.readouterr().err
+
+
+def test_evaluate_measures_each_row_once(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = [str(workshop / "footage.toml"), "--cache", str(workshop / "cache"), "--rows", str(workshop / "rows.jsonl")]
+    command += [
+        "--models",
+        "bicubic",
+        str(workshop / "tiny_x2.onnx"),
+        "--scales",
+        "2",
+        "--degradations",
+        "area",
+        "area@300",
+        "--frames",
+        "6",
+    ]
+    assert evaluate_main([*command, "--json"]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [(row["clip"], row["model"]) for row in rows] == [
+        ("a/five area", "bicubic"),
+        ("a/five area", "tiny"),
+        ("a/five area@300", "bicubic"),
+        ("a/five area@300", "tiny"),
+    ]
+    assert rows[0]["psnr_y_db"] > rows[2]["psnr_y_db"] > 10
+    before = (workshop / "rows.jsonl").read_bytes()
+    assert evaluate_main(command) == 0
+    assert (workshop / "rows.jsonl").read_bytes() == before
+    table = capsys.readouterr().out.splitlines()
+    assert len(table) == 6
+    assert table[2].startswith(f"| a | x2 | area | bicubic | {rows[0]['psnr_y_db']:.2f} |")
+
+
+@pytest.mark.parametrize(
+    ("main", "command", "sentence"),
+    [
+        (train_main, ["missing.toml", "run"], "not a footage list"),
+        (export_main, ["missing.pt", "name"], "not a checkpoint"),
+        (verify_main, ["missing.onnx", "missing.mp4"], "does not exist"),
+        (evaluate_main, ["missing.toml"], "not a footage list"),
+    ],
+)
+def test_what_is_not_there_is_one_sentence(
+    main: object, command: list[str], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert callable(main)
+    assert main(command) == 1
+    said = capsys.readouterr().err
+    assert sentence in said
+    assert said.count("\n") == 1
