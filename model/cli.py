@@ -65,7 +65,9 @@ def train_main(argv: Sequence[str] | None = None) -> int:
         parser.add_argument(f"--{name}", type=int, default=defaults[name], help=f"{text} (default: %(default)s)")
     parser.add_argument("--learning-rate", type=float, default=defaults["learning_rate"], help="AdamW's first rate (default: %(default)s)")
     parser.add_argument("--bfloat16", action="store_true", help="mixed precision: about twice as fast on AMX CPUs and on GPUs")
-    parser.add_argument("--initial-weights", default="", metavar="CHECKPOINT", help="start from another run's checkpoint.pt")
+    parser.add_argument(
+        "--initial-weights", default="", metavar="CHECKPOINT", help="start from another run's checkpoint.pt, as far as shapes fit"
+    )
     parser.add_argument("--cache", type=Path, default=Path("runs/cache"), help="decoded footage, may be deleted (default: %(default)s)")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu", help="cpu or cuda (default here: %(default)s)")
     parser.add_argument("--threads", type=int, help="CPU threads (default: all)")

@@ -98,7 +98,7 @@ class Trainer:
         self.network = GameSR(config.network()).to(self.device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         if config.initial_weights:
-            self.network.load_state_dict(load_checkpoint(Path(config.initial_weights))["network"])
+            self._start_from(load_checkpoint(Path(config.initial_weights))["network"])
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), config.learning_rate, betas=(0.9, 0.999), weight_decay=config.weight_decay
         )
@@ -121,6 +121,14 @@ class Trainer:
         self.network.load_state_dict(saved["network"])
         self.optimizer.load_state_dict(saved["optimizer"])
         self.step, self.seconds, self.held_out = saved["step"], saved["seconds"], saved["held_out"]
+
+    def _start_from(self, weights: dict[str, Tensor]) -> None:
+        """Take over every weight of the same name and shape; a network of another scale keeps its own head and base."""
+        own = self.network.state_dict()
+        fitting = {name: value for name, value in weights.items() if name in own and own[name].shape == value.shape}
+        if not fitting:
+            raise ModelError(f"{self.config.initial_weights} has no weight that fits this network")
+        self.network.load_state_dict({**own, **fitting})
 
     def save(self) -> None:
         state = {

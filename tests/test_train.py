@@ -41,6 +41,16 @@ def test_a_resumed_run_ends_at_the_same_weights(footage: Path, tmp_path: Path) -
         assert torch.equal(weight, parts["network"][name]), name
 
 
+def test_a_run_may_start_from_the_weights_of_another_scale(footage: Path, tmp_path: Path) -> None:
+    cache = FootageCache(tmp_path / "cache")
+    first = Trainer(TINY, footage, cache, tmp_path / "two")
+    first.run(validate_every=100, progress=False)
+    weights = str(tmp_path / "two" / "checkpoint.pt")
+    second = Trainer(TrainConfig(**{**TINY.__dict__, "scale": 3, "initial_weights": weights}), footage, cache, tmp_path / "three")
+    assert torch.equal(second.network.stem.weight, first.network.stem.weight)
+    assert second.network.head.weight.shape != first.network.head.weight.shape
+
+
 def test_training_lowers_the_loss_and_another_seed_is_another_run(footage: Path, tmp_path: Path) -> None:
     config = TrainConfig(degradations=("area",), steps=60, batch=2, patch=32, frames=4, window=2, warm_up_steps=5)
     cache = FootageCache(tmp_path / "cache")
