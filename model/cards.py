@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import MISSING, fields
+from pathlib import Path
 from typing import Any
 
 from model.train import TrainConfig
@@ -32,7 +33,9 @@ def training_command(config: TrainConfig) -> str:
         if value == field.default or field.default is MISSING:
             continue
         words.append("--" + field.name.replace("_", "-"))
-        if value is not True:
+        if field.name == "initial_weights":
+            words.append(str(Path(*Path(value).parts[-2:])))  # the run's own folder; where that lies is nobody's business
+        elif value is not True:
             words += [str(v) for v in value] if isinstance(value, (tuple, list)) else [str(value)]
     return " ".join(words)
 

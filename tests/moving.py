@@ -12,7 +12,7 @@ from client.frames import Frame
 from client.video import to_av_frame
 
 
-def picture(t: int, height: int = 96, width: int = 128) -> Frame:
+def picture(t: int, height: int = 96, width: int = 144) -> Frame:
     """A texture that moves two pixels a frame."""
     rows, columns = np.mgrid[:height, :width]
     luma = 128 + 60 * np.sin((columns + 2 * t) / 3) * np.cos(rows / 4)
@@ -21,10 +21,10 @@ def picture(t: int, height: int = 96, width: int = 128) -> Frame:
 
 
 def write_footage(folder: Path) -> Path:
-    """A footage list of four scenes of two games, all of them one clip of 12 frames, 128x96."""
+    """A footage list of four scenes of two games, all of them one clip of 12 frames, 144x96."""
     with av.open(str(folder / "clip.mkv"), "w") as container:
         stream = container.add_stream("libx264", rate=30, options={"qp": "4", "preset": "ultrafast"})
-        stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv420p"
+        stream.width, stream.height, stream.pix_fmt = 144, 96, "yuv420p"
         for t in range(12):
             frame = to_av_frame(picture(t))
             frame.pts, frame.time_base = t, Fraction(1, 30)

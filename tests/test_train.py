@@ -115,7 +115,7 @@ def test_the_codec_gives_every_frame_and_the_bitrate_decides_how_well() -> None:
 
 
 def test_the_cloud_encoder_holds_nothing_back() -> None:
-    encoder = CloudEncoder(CloudSettings(500, 30), 128, 96)
+    encoder = CloudEncoder(CloudSettings(500, 30), 144, 96)
     assert [len(encoder.encode(picture(t))) for t in range(40)] == [1] * 40
     assert encoder.flush() == []
 
