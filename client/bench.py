@@ -114,7 +114,7 @@ def parser() -> argparse.ArgumentParser:
         help="a shipped model at every scale it has, or an .onnx file; repeatable (default: all)",
     )
     parser.add_argument("--clip", metavar="FILE", type=Path, help="the video to upscale (default: a made one, at two sizes)")
-    parser.add_argument("--frames", metavar="N", type=_count, default=60, help="frames that count in a run (default: %(default)s)")
+    parser.add_argument("--frames", metavar="N", type=_count, default=30, help="frames that count in a run (default: %(default)s)")
     parser.add_argument("--rounds", metavar="N", type=_count, default=5, help="runs of every model (default: %(default)s)")
     parser.add_argument("--provider", choices=tuple(PROVIDERS), default="cpu", help="what runs the models (default: %(default)s)")
     parser.add_argument("--threads", metavar="N", type=_count, help="threads of the model (default: the physical cores)")

@@ -19,7 +19,7 @@ from client.timing import LatencySummary, stage_latencies
 from client.upscaler import OnnxUpscaler
 from client.video import VideoSource
 
-WARM_UP_FRAMES = 10
+WARM_UP_FRAMES = 5
 
 
 @dataclass(frozen=True)

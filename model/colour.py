@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from model.interpolation import Interpolation, exact
-
-if TYPE_CHECKING:
-    from model.network import Planes
 
 KR, KB = 0.2126, 0.0722  # ITU-R BT.709-6, item 3.2
 KG = 1 - KR - KB
@@ -62,11 +57,9 @@ class RgbToPlanes(nn.Module):
         taps = torch.outer(torch.tensor([0.5, 0.5]), torch.tensor([0.25, 0.5, 0.25]))
         self.register_buffer("chroma", taps.expand(2, 1, 2, 3).contiguous(), persistent=False)
 
-    def forward(self, rgb: Tensor) -> Planes:
-        from model.network import Planes
-
+    def forward(self, rgb: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         with exact(rgb):
             yuv = F.conv2d(rgb, self.matrix.to(rgb.dtype)) + self.offset.to(rgb.dtype)
             chroma = torch.cat((yuv[:, 1:, :, :1], yuv[:, 1:]), 3)  # the left edge replicated
             chroma = F.conv2d(chroma, self.chroma.to(rgb.dtype), stride=2, groups=2)
-        return Planes(yuv[:, :1], chroma[:, :1], chroma[:, 1:])
+        return yuv[:, :1], chroma[:, :1], chroma[:, 1:]

@@ -204,8 +204,7 @@ class GameSR(nn.Module):
         residual = self.tail(F.pixel_shuffle(F.relu(self.head(features)), side))
         channels = rgb.flatten(0, 1).unsqueeze(1)
         base = F.pixel_shuffle(self.rgb_base(channels), side).reshape(residual.shape)
-        picture: Planes = self.to_planes(base + RESIDUAL_GAIN * residual.to(base.dtype))
-        return picture
+        return Planes(*self.to_planes(base + RESIDUAL_GAIN * residual.to(base.dtype)))
 
 
 def parameter_count(network: nn.Module) -> int:

@@ -107,6 +107,7 @@ class Trainer:
             split: [f"{pair.title.split()[0]} ({len(pair)} frames)" for pair in (takes[0] for takes in pairs)]
             for split, pairs in (("train", self.train), ("validate", self.validate))
         }
+        self.commit = source_commit()
         self.step = 0
         self.seconds = 0.0
         self.held_out: dict[str, dict[str, float]] = {}
@@ -135,7 +136,7 @@ class Trainer:
             "format": CHECKPOINT_FORMAT,
             "config": asdict(self.config),
             "footage": self.footage,
-            "commit": source_commit(),
+            "commit": self.commit,
             "device": torch.cuda.get_device_name() if self.device.type == "cuda" else f"CPU, {torch.get_num_threads()} threads",
             "network": self.network.state_dict(),
             "optimizer": self.optimizer.state_dict(),
