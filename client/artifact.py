@@ -54,7 +54,9 @@ def load_session(model: Path, provider: str, threads: int) -> tuple[ort.Inferenc
     try:
         session = ort.InferenceSession(content, _session_options(threads), providers=[PROVIDERS[provider]])
     except Exception as error:  # the runtime's exceptions have no common base
-        raise ModelError(f"{model} is not a readable ONNX model: it is damaged or of another kind") from error
+        raise ModelError(
+            f"{model} is not a readable ONNX model: it is damaged, of another kind, or newer than ONNX Runtime {ort.__version__}"
+        ) from error
     if PROVIDERS[provider] not in session.get_providers():
         raise ProviderError(f"ONNX Runtime could not start its {provider} provider: check the driver, or use --provider cpu")
     try:
