@@ -213,6 +213,11 @@ def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace, work: C
             raise
         print(f"{parser.prog}: {error}", file=sys.stderr)
         return 1
+    except OSError as error:
+        if arguments.debug:
+            raise
+        print(f"{parser.prog}: {error.filename or 'file'}: {error.strerror}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print(f"{parser.prog}: {interrupted}", file=sys.stderr)
         return 130

@@ -78,6 +78,11 @@ def test_evaluate_measures_each_row_once(workshop: Path, capsys: pytest.CaptureF
     assert table[2].startswith(f"| a | x2 | area | bicubic | {rows[0]['psnr_y_db']:.2f} |")
 
 
+def test_a_missing_folder_is_one_sentence(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert export_main([str(workshop / "run" / "checkpoint.pt"), "tiny", "--folder", str(workshop / "nowhere")]) == 1
+    assert capsys.readouterr().err.endswith("No such file or directory\n")
+
+
 @pytest.mark.parametrize(
     ("main", "command", "sentence"),
     [
