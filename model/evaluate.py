@@ -14,7 +14,6 @@ from client.models import find_model
 from client.pipeline import upscale_stream
 from client.quality import QualityMeter
 from client.sink import NullSink
-from client.timing import stage_latencies
 from client.upscaler import OnnxUpscaler
 from client.video import Decoded
 from model.footage import Degradation, FootageCache, Pair, Scene, load_pairs
@@ -35,7 +34,7 @@ def evaluate(
 ) -> Iterator[Row]:
     """Every combination as a row of figures; rows already in `store` (JSON lines) are read from it, new ones appended.
 
-    A row is known by scene, input, scale, number of frames and the artifact's digest. A model that does not come in a
+    Speed is not measured here but by gamesr-bench, so rows may be made while something else runs. A row is known by scene, input, scale, number of frames and the artifact's digest. A model that does not come in a
     scale is left out there. Raises what reading footage and models raises.
     """
     known = _read_rows(store)
@@ -59,14 +58,10 @@ def _artifacts(models: Iterable[str], scale: int) -> list[Path]:
 
 
 def _measure(pair: Pair, upscaler: OnnxUpscaler, frames: int) -> Row:
-    upscaler.warm_up(pair.low.height, pair.low.width)
     with QualityMeter(pair.high.width, pair.high.height) as meter:
-        stamps = []
         for index, done in enumerate(upscale_stream(_decoded(pair, frames), upscaler, NullSink())):
-            stamps.append(done.stamps)
             meter.add(pair.high.frame(index), done.picture)
-        quality = meter.result().record()
-    return {**quality, "upscale_us": stage_latencies(stamps)["upscale"].record()}
+        return meter.result().record()
 
 
 def _decoded(pair: Pair, frames: int) -> Iterator[Decoded]:
@@ -94,13 +89,12 @@ def table(rows: Iterable[Row]) -> str:
         title, degradation = row["clip"].split()
         groups.setdefault((title.split("/")[0], row["scale"], degradation, row["model"]), []).append(row)
     lines = [
-        "| game | scale | input | model | PSNR-Y | PSNR-U | PSNR-V | SSIM-Y | VMAF | VMAF-NEG | temporal error | ms |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "| game | scale | input | model | PSNR-Y | PSNR-U | PSNR-V | SSIM-Y | VMAF | VMAF-NEG | temporal error |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for (game, scale, degradation, model), group in groups.items():
         cells = [_mean(group, name, digits) for name, digits in _COLUMNS]
-        milliseconds = fmean(row["upscale_us"]["p50"] for row in group) / 1000
-        lines.append(f"| {game} | x{scale} | {degradation} | {model} | {' | '.join(cells)} | {milliseconds:.0f} |")
+        lines.append(f"| {game} | x{scale} | {degradation} | {model} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
