@@ -34,12 +34,12 @@ def evaluate(
 ) -> Iterator[Row]:
     """Every combination as a row of figures; rows already in `store` (JSON lines) are read from it, new ones appended.
 
-    Speed is not measured here but by gamesr-bench, so rows may be made while something else runs. A row is known by scene, input, scale, number of frames and the artifact's digest. A model that does not come in a
-    scale is left out there. Raises what reading footage and models raises.
+    Speed is not measured here but by gamesr-bench, so rows may be made while something else runs. A row is known by clip,
+    scale, number of frames and the artifact's digest. Raises what reading footage and models raises.
     """
     known = _read_rows(store)
     for scale in scales:
-        upscalers = [OnnxUpscaler(path, threads=threads) for path in _artifacts(models, scale)]
+        upscalers = [OnnxUpscaler(find_model(name, scale), threads=threads) for name in models]
         for takes in load_pairs(scenes, cache, scale, degradations):
             for pair in takes:
                 for upscaler in upscalers:
@@ -51,10 +51,6 @@ def evaluate(
                         with store.open("a") as file:
                             file.write(json.dumps(row) + "\n")
                     yield row
-
-
-def _artifacts(models: Iterable[str], scale: int) -> list[Path]:
-    return [find_model(name, scale) for name in models]
 
 
 def _measure(pair: Pair, upscaler: OnnxUpscaler, frames: int) -> Row:
