@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import MISSING, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,10 @@ def training_card(checkpoint: dict[str, Any]) -> Card:
     config = TrainConfig(**checkpoint["config"])
     return {
         "command": training_command(config),
+        "before": [
+            {"command": training_command(TrainConfig(**run["config"])), "steps": run["step"], "training_seconds": round(run["seconds"])}
+            for run in checkpoint["before"]
+        ],
         "commit": checkpoint["commit"],
         "device": checkpoint["device"] + (", bfloat16" if config.bfloat16 else ""),
         "steps": checkpoint["step"],
@@ -30,7 +34,7 @@ def training_command(config: TrainConfig) -> str:
     words = ["gamesr-train", "FOOTAGE.toml", "RUN"]
     for field in fields(TrainConfig):
         value = getattr(config, field.name)
-        if value == field.default or field.default is MISSING:
+        if value == field.default:
             continue
         words.append("--" + field.name.replace("_", "-"))
         if field.name == "initial_weights":
@@ -42,15 +46,18 @@ def training_command(config: TrainConfig) -> str:
 
 def card_page(name: str, scale: int, card: Card) -> str:
     """The card as Markdown."""
-    hours = card["training_seconds"] / 3600
+    earlier = [
+        f"- Built on: `{run['command']}`, {run['steps']:,} steps in {run['training_seconds'] / 3600:.2f} h" for run in card["before"]
+    ]
     lines = [
         f"# {name} x{scale}",
         "",
         f"{card['parameters']:,} parameters ({card['parameters_in_training']:,} in training), float32.",
         "",
+        *earlier,
         f"- Command: `{card['command']}`",
         f"- Commit: {card['commit']}",
-        f"- Steps: {card['steps']:,} in {hours:.2f} h of training time on {card['device']}",
+        f"- Steps: {card['steps']:,} in {card['training_seconds'] / 3600:.2f} h of training time on {card['device']}",
         f"- Trained on: {', '.join(card['footage']['train'])}",
         f"- Held out while training: {', '.join(card['footage']['validate'])}",
         "",

@@ -97,8 +97,9 @@ class Trainer:
         torch.manual_seed(config.seed)
         self.network = GameSR(config.network()).to(self.device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.before: list[dict[str, Any]] = []  # the runs that this one builds on, oldest first
         if config.initial_weights:
-            self._start_from(load_checkpoint(Path(config.initial_weights))["network"])
+            self._start_from(load_checkpoint(Path(config.initial_weights)))
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), config.learning_rate, betas=(0.9, 0.999), weight_decay=config.weight_decay
         )
@@ -123,19 +124,21 @@ class Trainer:
         self.optimizer.load_state_dict(saved["optimizer"])
         self.step, self.seconds, self.held_out = saved["step"], saved["seconds"], saved["held_out"]
 
-    def _start_from(self, weights: dict[str, Tensor]) -> None:
+    def _start_from(self, earlier: dict[str, Any]) -> None:
         """Take over every weight of the same name and shape; a network of another scale keeps its own head and base."""
         own = self.network.state_dict()
-        fitting = {name: value for name, value in weights.items() if name in own and own[name].shape == value.shape}
+        fitting = {name: value for name, value in earlier["network"].items() if name in own and own[name].shape == value.shape}
         if not fitting:
             raise ModelError(f"{self.config.initial_weights} has no weight that fits this network")
         self.network.load_state_dict({**own, **fitting})
+        self.before = [*earlier["before"], {"config": earlier["config"], "step": earlier["step"], "seconds": earlier["seconds"]}]
 
     def save(self) -> None:
         state = {
             "format": CHECKPOINT_FORMAT,
             "config": asdict(self.config),
             "footage": self.footage,
+            "before": self.before,
             "commit": self.commit,
             "device": torch.cuda.get_device_name() if self.device.type == "cuda" else f"CPU, {torch.get_num_threads()} threads",
             "network": self.network.state_dict(),
