@@ -140,7 +140,7 @@ class Trainer:
             "footage": self.footage,
             "before": self.before,
             "commit": self.commit,
-            "device": torch.cuda.get_device_name() if self.device.type == "cuda" else f"CPU, {torch.get_num_threads()} threads",
+            "device": torch.cuda.get_device_name() if self.device.type == "cuda" else f"CPU, threads {torch.get_num_threads()}",
             "network": self.network.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "step": self.step,

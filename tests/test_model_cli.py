@@ -35,6 +35,16 @@ def test_the_artifact_and_its_card_say_how_it_was_made(workshop: Path) -> None:
     assert "| a/four area | " in page
 
 
+def test_a_card_names_the_runs_that_a_run_was_built_on(workshop: Path) -> None:
+    again = ["--cache", str(workshop / "cache"), "--initial-weights", str(workshop / "run" / "checkpoint.pt"), *TINY]
+    assert train_main([str(workshop / "footage.toml"), str(workshop / "further"), *again]) == 0
+    assert export_main([str(workshop / "further" / "checkpoint.pt"), "further", "--folder", str(workshop)]) == 0
+    page = (workshop / "further_x2.md").read_text()
+    assert "- Built on: `gamesr-train FOOTAGE.toml RUN --degradations area --steps 4 " in page
+    assert "--initial-weights run/checkpoint.pt`" in page
+    assert str(workshop) not in page
+
+
 def test_verify_holds_the_artifact_against_float64(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = [str(workshop / "tiny_x2.onnx"), str(workshop / "clip.mkv"), "--steps", "12", "--crop", "48x32"]
     assert verify_main([*command, "--json"]) == 0
