@@ -132,7 +132,7 @@ def verify_main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("model", type=Path, help="a trained .onnx artifact")
     parser.add_argument("clip", type=Path, help="a low-resolution video; it is played forwards and backwards")
     parser.add_argument("--steps", type=int, default=300, help="recurrent steps (default: %(default)s)")
-    parser.add_argument("--crop", default="320x180", metavar="WxH", help="the middle of the picture, both even (default: %(default)s)")
+    parser.add_argument("--crop", default="192x108", metavar="WxH", help="the middle of the picture, both even (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="a JSON line a step instead of the table")
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     arguments = parser.parse_args(argv)
