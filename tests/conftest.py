@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 from collections.abc import Callable, Iterator
 from fractions import Fraction
@@ -17,6 +18,8 @@ from onnx import TensorProto, helper
 
 from client.frames import Frame
 from client.video import to_av_frame
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch's threads cost more than they bring on pictures of this size
 
 WIDTH, HEIGHT, FRAMES, FPS = 64, 48, 12, 30
 
