@@ -21,16 +21,23 @@ def picture(t: int, height: int = 96, width: int = 144) -> Frame:
 
 
 def write_footage(folder: Path) -> Path:
-    """A footage list of four scenes of two games, all of them one clip of 12 frames, 144x96."""
-    with av.open(str(folder / "clip.mkv"), "w") as container:
+    """A footage list of five scenes of two games, all of them one clip of 12 frames, 144x96; the first has a native 48p render."""
+    _write_clip(folder / "clip.mkv", 96, 144)
+    _write_clip(folder / "native.mkv", 48, 72)
+    scene = '[[scene]]\nname = "{}"\ngame = "{}"\nsplit = "{}"\nfps = 30\nreference = "clip.mkv"\n'
+    rows = [("one", "a", "train"), ("two", "b", "train"), ("three", "b", "train"), ("four", "a", "validate"), ("five", "a", "test")]
+    scenes = [scene.format(*row) for row in rows]
+    scenes[0] += 'native = { 48 = "native.mkv" }\n'
+    (folder / "footage.toml").write_text("\n".join(scenes))
+    return folder / "footage.toml"
+
+
+def _write_clip(path: Path, height: int, width: int) -> None:
+    with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=30, options={"qp": "4", "preset": "ultrafast"})
-        stream.width, stream.height, stream.pix_fmt = 144, 96, "yuv420p"
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         for t in range(12):
-            frame = to_av_frame(picture(t))
+            frame = to_av_frame(picture(t, height, width))
             frame.pts, frame.time_base = t, Fraction(1, 30)
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-    scene = '[[scene]]\nname = "{}"\ngame = "{}"\nsplit = "{}"\nfps = 30\nreference = "clip.mkv"\n'
-    rows = [("one", "a", "train"), ("two", "b", "train"), ("three", "b", "train"), ("four", "a", "validate"), ("five", "a", "test")]
-    (folder / "footage.toml").write_text("\n".join(scene.format(*row) for row in rows))
-    return folder / "footage.toml"

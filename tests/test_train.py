@@ -89,6 +89,18 @@ def test_a_batch_is_a_function_of_seed_and_index(footage: Path, tmp_path: Path) 
     assert np.abs(mean - first[0][0]).max() <= 0.5
 
 
+def test_a_native_render_stands_in_for_the_downscaled_picture(footage: Path, tmp_path: Path) -> None:
+    scenes = load_scenes(footage, split="train")
+    pairs = load_pairs(scenes, FootageCache(tmp_path), 2, [Degradation("native"), Degradation("native", 300)])
+    assert [[pair.title for pair in takes] for takes in pairs] == [["a/one native", "a/one native@300"]]  # the others have none
+    clean, encoded = pairs[0]
+    rendered, downscaled = picture(3, 48, 72).y.astype(int), area_downscale(picture(3), 2).y
+    assert np.abs(clean.low.frame(3).y - rendered).mean() < 2 < np.abs(clean.low.frame(3).y - downscaled.astype(int)).mean()
+    assert not np.array_equal(encoded.low.frame(3).y, clean.low.frame(3).y)
+    with pytest.raises(InputError, match="no native 32p render"):
+        FootageCache(tmp_path).degraded(scenes[0], 3, Degradation("native"))
+
+
 @pytest.mark.parametrize("scale", [2, 3])
 def test_area_downscale_keeps_means_and_the_place_of_chroma(scale: int) -> None:
     frame = picture(0, 48, 96)
