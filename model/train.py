@@ -168,6 +168,8 @@ class Trainer:
             low, high = (to_planes(a, self.device) for a in arrays)
             state = self.network.initial_state(config.batch, config.patch, config.patch)
             for first in range(0, config.frames, config.window):
+                if self.step == config.steps:
+                    return
                 span = slice(first, first + config.window)
                 started = time.perf_counter()
                 loss, state = self._update(Planes(*(p[:, span] for p in low)), Planes(*(p[:, span] for p in high)), state)

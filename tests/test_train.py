@@ -56,6 +56,8 @@ def test_training_lowers_the_loss_and_another_seed_is_another_run(footage: Path,
     cache = FootageCache(tmp_path / "cache")
     losses = list(Trainer(config, footage, cache, tmp_path / "a").losses())
     assert np.mean(losses[-10:]) < 0.8 * np.mean(losses[:10])
+    odd = Trainer(TrainConfig(**{**TINY.__dict__, "steps": 3}), footage, cache, tmp_path / "odd")
+    assert len(list(odd.losses())) == odd.step == 3  # not a whole number of clips
     other = Trainer(TrainConfig(**{**TINY.__dict__, "seed": 1}), footage, cache, tmp_path / "b")
     assert next(other.losses()) != losses[0]
 
