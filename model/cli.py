@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from client.errors import GamesrError, ModelError
+from client.errors import GamesrError, InputError, ModelError
 from client.models import WEIGHTS
 from client.video import VideoSource
 from model.cards import card_page, training_card
@@ -141,6 +141,8 @@ def verify_main(argv: Sequence[str] | None = None) -> int:
         width, height = parse_size(arguments.crop)
         with VideoSource(arguments.clip) as source:
             frames = [crop(item.frame, width, height) for item in source]
+        if not frames:
+            raise InputError(f"no frame of {arguments.clip} could be decoded")
         shown = {1, 10, 100, arguments.steps}
         worst = 0
         for error in parity(arguments.model, frames, arguments.steps):
