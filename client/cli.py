@@ -155,6 +155,9 @@ def upscale(arguments: argparse.Namespace) -> Summary:
 
 def _source_notes(source: VideoSource, frames: int, *, measured: bool) -> list[str]:
     notes = []
+    estimated = source.estimated_frames
+    if source.announced_frames is None and estimated is not None and frames < 0.9 * estimated:  # a rate that varies is no cut
+        notes.append(f"the file's duration means about {estimated} frames, {frames} could be decoded: it may be cut short")
     if source.announced_frames is not None and source.announced_frames != frames:
         notes.append(f"the file announces {source.announced_frames} frames, {frames} could be decoded")
         if measured:

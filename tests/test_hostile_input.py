@@ -123,6 +123,16 @@ def test_mp4_cut_after_its_index(saved: Run, make_clip: MakeClip, tmp_path: Path
     assert any(f"announces 12 frames, {record['frames']} could be decoded" in note for note in record["notes"])
 
 
+def test_mkv_cut_short_is_said(saved: Run, make_clip: MakeClip, tmp_path: Path) -> None:
+    whole = make_clip("clip.mkv")
+    assert saved(whole)["notes"] == []
+    (tmp_path / "saved.mp4").unlink()
+    content = whole.read_bytes()
+    record = saved(write(tmp_path / "cut.mkv", content[: len(content) // 2]))
+    assert 0 < int(str(record["frames"])) < 0.9 * FRAMES
+    assert "it may be cut short" in str(record["notes"])
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_flipped_bits(saved: Run, make_clip: MakeClip, tmp_path: Path, seed: int) -> None:
     content = bytearray(make_clip("clip.h264", options={"g": "4", "crf": "10"}).read_bytes())
