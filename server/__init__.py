@@ -1,0 +1,1 @@
+"""Measures and reports: what upscaling on the client buys in bits, and what it costs in milliseconds."""
