@@ -52,7 +52,7 @@ def load_session(model: Path, provider: str, threads: int) -> tuple[ort.Inferenc
     _check_provider(provider)
     content = _read(model)
     try:
-        session = ort.InferenceSession(content, _session_options(threads), providers=[PROVIDERS[provider]])
+        session = ort.InferenceSession(content, session_options(threads), providers=[PROVIDERS[provider]])
     except Exception as error:  # the runtime's exceptions have no common base
         raise ModelError(
             f"{model} is not a readable ONNX model: it is damaged, of another kind, or newer than ONNX Runtime {ort.__version__}"
@@ -87,7 +87,8 @@ def _read(model: Path) -> bytes:
         raise ModelError(f"model {model} cannot be read: {error.strerror}") from error
 
 
-def _session_options(threads: int) -> ort.SessionOptions:
+def session_options(threads: int) -> ort.SessionOptions:
+    """How every session of this product runs: `threads` for one operator, none of them spinning, nothing read beside the model."""
     options = ort.SessionOptions()
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL

@@ -10,7 +10,7 @@ import av
 import numpy as np
 from av.video.codeccontext import VideoCodecContext
 
-from client.frames import BT709_LIMITED, Frame, Plane
+from client.frames import BT709_LIMITED, ColourTags, Frame, Plane
 from client.video import from_av_frame, to_av_frame
 
 
@@ -74,14 +74,14 @@ def _round_divide(total: np.ndarray, count: int) -> Plane:
 class CloudEncoder:
     """Frames in, H.264 packets out; nothing is held back (zerolatency, no B-frames)."""
 
-    def __init__(self, settings: CloudSettings, width: int, height: int) -> None:
+    def __init__(self, settings: CloudSettings, width: int, height: int, colour: ColourTags = BT709_LIMITED) -> None:
         context = av.CodecContext.create("libx264", "w")
         assert isinstance(context, VideoCodecContext)
         context.width, context.height, context.pix_fmt = width, height, "yuv420p"
         context.time_base = Fraction(1, settings.fps)
         context.framerate = Fraction(settings.fps)
-        context.color_range, context.colorspace = BT709_LIMITED.range, BT709_LIMITED.matrix
-        context.color_primaries, context.color_trc = BT709_LIMITED.primaries, BT709_LIMITED.transfer
+        context.color_range, context.colorspace = colour.range, colour.matrix
+        context.color_primaries, context.color_trc = colour.primaries, colour.transfer
         context.options = {"preset": settings.preset, "tune": "zerolatency", "x264-params": settings.x264_params()}
         self._context = context
         self._index = 0

@@ -7,19 +7,23 @@ import multiprocessing
 import re
 import signal
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import TypeVar
 
 from client.artifact import ModelSpec
 from client.errors import GamesrError, InputError
 from client.pipeline import upscale_stream
 from client.sink import NullSink
-from client.timing import LatencySummary, stage_latencies
+from client.timing import LatencySummary, Stamps, stage_latencies
 from client.upscaler import OnnxUpscaler
 from client.video import VideoSource
 
 WARM_UP_FRAMES = 5
+Argument = TypeVar("Argument")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -37,19 +41,27 @@ class Task:
 class Run:
     """What one run took.
 
-    `latency_us` is by stage: decode, upscale, write (handed to a sink that forgets it), total. `fps` is frames per second
-    of total. `first_frame_ms` is the time to load the model and that of its first step. `peak_memory_mib` is the largest
-    resident size of the whole process, None where the system does not tell.
+    `stamps` are of the frames that count. `first_frame_ms` is the time to load the model and that of its first step.
+    `peak_memory_mib` is the largest resident size of the whole process, None where the system does not tell.
     """
 
     spec: ModelSpec
     threads: int
     width: int
     height: int
-    fps: float
+    stamps: Sequence[Stamps]
     first_frame_ms: float
     peak_memory_mib: float | None
-    latency_us: dict[str, LatencySummary]
+
+    @property
+    def latency_us(self) -> dict[str, LatencySummary]:
+        """By stage: decode, upscale, write (handed to a sink that forgets it), total."""
+        return stage_latencies(self.stamps)
+
+    @property
+    def fps(self) -> float:
+        """Frames per second of total."""
+        return len(self.stamps) / (sum(s.written_ns - s.packet_ns for s in self.stamps) / 1e9)
 
 
 def measure(task: Task) -> Run:
@@ -68,26 +80,30 @@ def measure(task: Task) -> Run:
             threads=upscaler.threads,
             width=source.width,
             height=source.height,
-            fps=len(counted) / (sum(s.written_ns - s.packet_ns for s in counted) / 1e9),
+            stamps=counted,
             first_frame_ms=(load_ns + stamps[0].upscaled_ns - stamps[0].decoded_ns) / 1e6,
             peak_memory_mib=_peak_memory_mib(),
-            latency_us=stage_latencies(counted),
         )
 
 
 def measure_in_fresh_process(task: Task) -> Run:
     """`measure`, where no earlier run has left memory or warmth behind; raises what it raises."""
+    return in_fresh_process(measure, task, f"the process that measured {task.model.name}")
+
+
+def in_fresh_process(function: Callable[[Argument], Result], argument: Argument, what: str) -> Result:
+    """`function(argument)` in a process of its own; raises the GamesrError that it raises, or that `what` ended when it dies."""
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_report, args=(task, sender), daemon=True)
+    process = context.Process(target=_report, args=(function, argument, sender), daemon=True)
     process.start()
     sender.close()
     try:
         with receiver:
-            outcome: Run | GamesrError = receiver.recv()
+            outcome: Result | GamesrError = receiver.recv()
     except EOFError:
         process.join()
-        raise GamesrError(f"the process that measured {task.model.name} ended with status {process.exitcode}") from None
+        raise GamesrError(f"{what} ended with status {process.exitcode}") from None
     finally:
         process.kill()
         process.join()
@@ -97,10 +113,10 @@ def measure_in_fresh_process(task: Task) -> Run:
     return outcome
 
 
-def _report(task: Task, sender: Connection) -> None:
+def _report(function: Callable[[Argument], Result], argument: Argument, sender: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it too, and ends this process
     try:
-        sender.send(measure(task))
+        sender.send(function(argument))
     except GamesrError as error:
         sender.send(error)
 

@@ -35,12 +35,13 @@ class Progress:
         fps = self._frames / max(now - self._begin, 1e-6)
         line = f"{self._frames} frames, {fps:.1f} frames/s"
         if self._total is not None and self._total > self._frames:
-            line = f"{self._frames}/{self._total} frames, {fps:.1f} frames/s, {_clock((self._total - self._frames) / fps)} left"
+            line = f"{self._frames}/{self._total} frames, {fps:.1f} frames/s, {clock((self._total - self._frames) / fps)} left"
         self._stream.write(f"\r\x1b[K{line}")
         self._stream.flush()
 
 
-def _clock(seconds: float) -> str:
+def clock(seconds: float) -> str:
+    """A duration as m:ss or h:mm:ss."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

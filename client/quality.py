@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from client.errors import InputError
 from client.frames import Frame, Plane
-from client.vmaf import VmafRun, why_unavailable
+from client.vmaf import THREADS, VmafRun, why_unavailable
 
 PEAK = 255
 SSIM_WINDOW = 11
@@ -134,7 +134,7 @@ class QualityMeter:
     is left out with its reason where it is not wanted or not installed.
     """
 
-    def __init__(self, width: int, height: int, *, vmaf: bool = True) -> None:
+    def __init__(self, width: int, height: int, *, vmaf: bool = True, vmaf_threads: int = THREADS) -> None:
         self._size = (width, height)
         self._frames = 0
         self._squared = [0, 0, 0]
@@ -142,7 +142,7 @@ class QualityMeter:
         self._change_squared = 0
         self._last_difference: NDArray[np.int16] | None = None
         self._no_vmaf = why_unavailable(width, height) if vmaf else "VMAF was not asked for"
-        self._vmaf = VmafRun(width, height) if self._no_vmaf is None else None
+        self._vmaf = VmafRun(width, height, threads=vmaf_threads) if self._no_vmaf is None else None
 
     def __enter__(self) -> Self:
         return self

@@ -44,6 +44,11 @@ class LatencySummary:
         return asdict(self)
 
 
+def deadline_misses(durations_ns: Sequence[int], fps: int) -> int:
+    """How many durations are longer than one frame lasts at `fps` frames per second."""
+    return sum(duration_ns * fps > 1_000_000_000 for duration_ns in durations_ns)
+
+
 def stage_latencies(stamps: Sequence[Stamps]) -> dict[str, LatencySummary]:
     """Summaries of decode, upscale, write and total; raises ValueError when there are no stamps."""
     return {

@@ -71,12 +71,12 @@ class VmafRun:
     NEG (no enhancement gain): Z. Li et al., "Toward a Better Quality Metric for the Video Community", same place, 2020.
     """
 
-    def __init__(self, width: int, height: int) -> None:
+    def __init__(self, width: int, height: int, *, threads: int = THREADS) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="gamesr-vmaf-")
         rows = height + height % 2  # each half starts on a whole chroma row
         command = [_ffmpeg(), "-hide_banner", "-nostdin", "-loglevel", "error"]
         command += ["-f", "rawvideo", "-pix_fmt", "yuv420p", "-video_size", f"{width}x{2 * rows}", "-framerate", "60", "-i", "pipe:0"]
-        command += ["-filter_complex", _graph(width, height, rows), "-f", "null", "-"]
+        command += ["-filter_complex", _graph(width, height, rows, threads), "-f", "null", "-"]
         self._log = Path(self._folder.name) / "stderr"
         try:
             with self._log.open("wb") as log:
@@ -138,12 +138,12 @@ class VmafRun:
         return GamesrError(f"VMAF: ffmpeg stopped: {lines[-1] if lines else f'exit status {status}'}")
 
 
-def _graph(width: int, height: int, rows: int) -> str:
+def _graph(width: int, height: int, rows: int, threads: int) -> str:
     models = "|".join(rf"version={version}\:name={name}" for name, version in MODELS.items())
     crop = f"crop={width}:{height}:0"
     return (
         f"[0:v]split[above][below];[above]{crop}:0:exact=1[distorted];[below]{crop}:{rows}:exact=1[reference];"
-        f"[distorted][reference]libvmaf=model='{models}':n_threads={THREADS}:log_fmt=json:log_path=vmaf.json"
+        f"[distorted][reference]libvmaf=model='{models}':n_threads={threads}:log_fmt=json:log_path=vmaf.json"
     )
 
 
