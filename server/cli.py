@@ -1,0 +1,240 @@
+"""gamesr-sweep: rate-distortion curves of every upscaler on any clips, and what it costs in milliseconds."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import FrameType
+
+from client.cores import physical_cores
+from client.errors import GamesrError, OutputError
+from server.cluster import DaskWorkers
+from server.events import (
+    Event,
+    LatencyDone,
+    LatencyFailed,
+    LatencyReused,
+    PointDone,
+    PointFailed,
+    PointReused,
+    SweepDone,
+    event_record,
+)
+from server.export import points_csv, sweep_json, write_whole
+from server.plan import Plan, Request, make_plan
+from server.points import LatencyResult, PointResult
+from server.progress import SweepProgress
+from server.store import Store
+from server.summary import summary
+from server.sweep import run_sweep
+from server.workers import LocalWorkers, Workers
+
+PROGRAM = "gamesr-sweep"
+EXAMPLES = """\
+examples:
+  gamesr-sweep match_1080p.mp4 --out report
+      half and a third of the height, the default bitrates and upscalers; report/ gets the results
+  gamesr-sweep match_1080p.mkv --heights 540 --bitrates 2,4,8,16 --upscalers none,bicubic,gamesr,mine_x2.onnx --frames 120
+      one height, two shipped models, one of yours and the native curve, over the first 120 frames
+  gamesr-sweep match_1080p.mkv --render match_1080p.mkv match_540p.mkv
+      at 540 lines the picture was rendered by the game and not downscaled
+
+what is measured:
+  The clip is downscaled by area (or taken from --render), encoded as a cloud-gaming server does (x264 zerolatency, veryfast,
+  no B-frames, one reference, an IDR every second, a VBV of four frames), decoded, upscaled by the code that gamesr-upscale
+  runs, and measured against the clip. The upscaler `none` is the clip itself, encoded at its full size. Points use the true
+  bitrate, counted from packets. When all points are there, latency is measured on the stream of the middle bitrate, with
+  nothing else of the sweep running.
+
+Results are kept in the store: the same command goes on where it was stopped, and another one reuses what it shares.
+Exit status: 0 done, 1 refused or something failed (one sentence says why; what was finished stays), 2 wrong usage,
+130 interrupted.
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM,
+        description="Measure what upscaling on the client buys in bits, and what it costs in milliseconds.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("clips", metavar="CLIP", nargs="+", type=Path, help="a video in full size, which everything is measured against")
+    parser.add_argument(
+        "--bitrates", metavar="MBPS,...", type=_megabits, default="2,4,6,8,13,20,25", help="megabits a second (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--heights", metavar="LINES,...", type=_counts, help="heights to encode at (default: half and a third of each clip's)"
+    )
+    parser.add_argument(
+        "--upscalers",
+        metavar="NAME|FILE,...",
+        type=_names,
+        default="none,bicubic,lanczos,gamesr",
+        help="shipped models or .onnx files; none is the clip itself at full size (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--render",
+        metavar=("CLIP", "SMALL"),
+        nargs=2,
+        type=Path,
+        action="append",
+        default=[],
+        help="SMALL shows the same frames as CLIP, rendered at half or a third of its size; repeatable",
+    )
+    parser.add_argument("--fps", metavar="N", type=_count, help="frames a second, a whole part of the clips' own rate (default: that rate)")
+    parser.add_argument("--frames", metavar="N", type=_count, help="measure at most so many frames of each clip (default: all)")
+    parser.add_argument(
+        "--lpips",
+        metavar="FILE",
+        type=Path,
+        help="an ONNX file of LPIPS: two RGB pictures in, float32 (1, 3, H, W) in -1..1, one number out",
+    )
+    parser.add_argument(
+        "--jobs", metavar="N", type=_count, default=physical_cores(), help="worker processes (default: the physical cores, %(default)s)"
+    )
+    parser.add_argument("--dask", metavar="ADDRESS", help="compute on the cluster of this Dask scheduler; latency is still measured here")
+    parser.add_argument(
+        "--store", metavar="FILE", type=Path, default=Path("gamesr-sweep.sqlite"), help="where results are kept (default: %(default)s)"
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, help="write points.csv and sweep.json into this folder")
+    parser.add_argument("--force", action="store_true", help="write into a folder that is not empty")
+    parser.add_argument("--json", action="store_true", help="print every event as one line of JSON instead of the summary")
+    parser.add_argument("--debug", action="store_true", help="show where an error came from")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit status."""
+    arguments = parser().parse_args(argv)
+    for signum in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signum, _interrupt)
+    try:
+        failures = sweep(arguments)
+    except KeyboardInterrupt:
+        return _fail(f"interrupted: what was finished is in {arguments.store}, and the same command goes on", 130)
+    except GamesrError as error:
+        if arguments.debug:
+            traceback.print_exc()
+        return _fail(str(error), 1)
+    except BrokenPipeError:
+        # Whoever read the events has gone; the interpreter would complain again when it flushes at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    if failures:
+        if arguments.debug:
+            print(failures[0].trace, file=sys.stderr)
+        points = sum(isinstance(failure, PointFailed) for failure in failures)
+        return _fail(f"{points} points and {len(failures) - points} latencies failed, the first one so: {failures[0].reason}", 1)
+    return 0
+
+
+def sweep(arguments: argparse.Namespace) -> list[PointFailed | LatencyFailed]:
+    """Everything between the arguments and what is printed; returns what failed. Raises GamesrError."""
+    _prepare(arguments.out, arguments.force)
+    request = Request(
+        clips=arguments.clips,
+        bitrates_kbps=arguments.bitrates,
+        upscalers=arguments.upscalers,
+        heights=arguments.heights,
+        renders=[tuple(pair) for pair in arguments.render],
+        fps=arguments.fps,
+        frames=arguments.frames,
+        lpips=arguments.lpips,
+    )
+    plan = make_plan(request)
+    found = _Found(plan)
+    with ExitStack() as stack:
+        store = stack.enter_context(Store(arguments.store))
+        workers: Workers = stack.enter_context(DaskWorkers(arguments.dask)) if arguments.dask else LocalWorkers(arguments.jobs)
+        progress = stack.enter_context(SweepProgress(sys.stderr))
+        for event in run_sweep(plan, store, workers):
+            found.take(event)
+            progress.show(event)
+            if arguments.json:
+                print(json.dumps(event_record(event), allow_nan=False), flush=True)
+    if not arguments.json:
+        print(summary(found.points, found.latencies, found.done), flush=True)
+    if arguments.out:
+        write_whole(arguments.out / "points.csv", points_csv(found.points))
+        write_whole(arguments.out / "sweep.json", sweep_json(found.points, found.latencies, found.done))
+    return found.failures
+
+
+class _Found:
+    """What the events brought, in the order of the plan."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._order = {point.key: index for index, point in enumerate(plan.points)}
+        self._points: list[PointResult] = []
+        self.latencies: list[LatencyResult] = []
+        self.failures: list[PointFailed | LatencyFailed] = []
+        self.done = SweepDone(0, 0, 0, 0.0, 0.0)
+
+    def take(self, event: Event) -> None:
+        if isinstance(event, PointDone | PointReused):
+            self._points.append(event.result)
+        elif isinstance(event, LatencyDone | LatencyReused):
+            self.latencies.append(event.result)
+        elif isinstance(event, PointFailed | LatencyFailed):
+            self.failures.append(event)
+        elif isinstance(event, SweepDone):
+            self.done = event
+
+    @property
+    def points(self) -> list[PointResult]:
+        return sorted(self._points, key=lambda result: self._order[result.point.key])
+
+
+def _prepare(out: Path | None, force: bool) -> None:
+    """The folder is there, and empty or given up, before hours of work go into what is to be written there."""
+    if out is None:
+        return
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if any(out.iterdir()) and not force:
+            raise OutputError(f"{out} is not empty: name another folder with --out, or replace what is in it with --force")
+    except OSError as error:
+        raise OutputError(f"cannot write into {out}: {error.strerror}") from error
+
+
+def _names(text: str) -> list[str]:
+    return text.split(",")
+
+
+def _counts(text: str) -> list[int]:
+    return [_count(part) for part in text.split(",")]
+
+
+def _megabits(text: str) -> list[int]:
+    """Megabits a second, as kilobits."""
+    values = [round(float(part) * 1000) for part in text.split(",")]
+    if not all(1 <= value <= 1_000_000 for value in values):
+        raise argparse.ArgumentTypeError(f"{text} is not between 0.001 and 1000 megabits a second")
+    return values
+
+
+def _count(text: str) -> int:
+    count = int(text)
+    if count < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not 1 or more")
+    return count
+
+
+def _interrupt(signum: int, frame: FrameType | None) -> None:
+    # A second signal must not stop the workers from being stopped.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    raise KeyboardInterrupt
+
+
+def _fail(sentence: str, status: int) -> int:
+    print(f"{PROGRAM}: {sentence}", file=sys.stderr)
+    return status

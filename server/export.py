@@ -1,0 +1,62 @@
+"""A sweep's results for other programs: a table of points as CSV, everything as JSON."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import secrets
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from client.errors import OutputError
+from server.events import SweepDone
+from server.points import LatencyResult, PointResult
+
+
+def points_csv(results: Sequence[PointResult]) -> str:
+    """One line a point, one column a figure; an undefined one is empty, its reason is in the JSON."""
+    target = io.StringIO()
+    rows = [_row(result) for result in results]
+    writer = csv.DictWriter(target, list(rows[0]) if rows else [], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return target.getvalue()
+
+
+def sweep_json(results: Sequence[PointResult], latencies: Sequence[LatencyResult], done: SweepDone) -> str:
+    """Every point with its settings, figures and reasons, every latency, and what the harness took."""
+    record = {
+        "points": [{"key": result.point.key, **result.record()} for result in results],
+        "latencies": [latency.record() for latency in latencies],
+        "harness": {"work_s": done.work_s, "worker_s": done.worker_s, "overhead": done.overhead},
+    }
+    return json.dumps(record, indent=1, allow_nan=False) + "\n"
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file that appears whole or not at all; raises OutputError."""
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        partial.write_text(text)
+        partial.replace(path)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _row(result: PointResult) -> dict[str, Any]:
+    point, quality = result.point, result.quality.record()
+    del quality["undefined"]
+    asked = ("clip", "width", "height", "fps", "low_height", "upscaler", "requested_kbps")
+    return {
+        **{name: getattr(point, name) for name in asked},
+        "rendered_small": point.low_sha256 is not None,
+        "bitrate_kbps": result.bitrate_kbps,
+        "flags": " ".join(flag.name for flag in result.flags),
+        **quality,
+        "lpips": result.lpips,
+        "key": point.key,
+    }
