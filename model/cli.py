@@ -18,7 +18,7 @@ from client.models import WEIGHTS
 from client.video import VideoSource
 from model.cards import card_page, training_card
 from model.evaluate import evaluate, table
-from model.export import export_baseline, export_network
+from model.export import BASELINES, export_baseline, export_network
 from model.footage import Degradation, FootageCache, load_scenes
 from model.network import PRESETS
 from model.train import TrainConfig, Trainer, load_checkpoint, network_of
@@ -103,14 +103,14 @@ def export_main(argv: Sequence[str] | None = None) -> int:
         epilog="examples:\n  gamesr-export runs/openarena_x2/checkpoint.pt gamesr-openarena\n  gamesr-export bicubic bicubic",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("weights", help="a run's checkpoint.pt; or bicubic or lanczos, for both scales")
+    parser.add_argument("weights", help=f"a run's checkpoint.pt; or {', '.join(BASELINES)}, for both scales")
     parser.add_argument("name", help="the model's name; its files are NAME_xSCALE.onnx and .md")
     parser.add_argument("--folder", type=Path, default=WEIGHTS, help="where to (default: %(default)s)")
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     arguments = parser.parse_args(argv)
 
     def work() -> None:
-        if arguments.weights in ("bicubic", "lanczos"):
+        if arguments.weights in BASELINES:
             for scale in (2, 3):
                 export_baseline(arguments.weights, scale, arguments.folder / f"{arguments.name}_x{scale}.onnx")
             return

@@ -18,12 +18,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from model.fsr1 import SHARPNESS_STOPS, Fsr1
 from model.interpolation import Interpolation, chroma_shift
 from model.network import GameSR, Planes, State, parameter_count
 from model.reparam import fuse
 
 FORMAT_VERSION = "1"
 OPSET = 20  # the first with Gelu as one operator: 15% of a frame's time on a CPU
+FSR1_PASSES = {"easu": "EASU", "fsr1": f"EASU, then RCAS at {SHARPNESS_STOPS} stops"}
+BASELINES = ("bicubic", "lanczos", *FSR1_PASSES)
 
 
 def to_codes(plane: Tensor) -> Tensor:
@@ -47,6 +50,18 @@ class Baseline(nn.Module):
         luma = F.pixel_shuffle(to_codes(self.luma(y.float())), 2 * self.side)
         chroma = F.pixel_shuffle(to_codes(self.chroma(torch.cat((u, v)).float())), self.side)
         return luma, chroma[:1], chroma[1:]
+
+
+class Fsr1Baseline(nn.Module):
+    """FSR 1 behind the artifact's contract; with RCAS or, as `easu`, without."""
+
+    def __init__(self, scale: int, *, sharpen: bool) -> None:
+        super().__init__()
+        self.fsr1 = Fsr1(scale, sharpen=sharpen)
+
+    def forward(self, y: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        y, u, v = self.fsr1(y.float(), u.float(), v.float())
+        return to_codes(y), to_codes(u), to_codes(v)
 
 
 class Frontend(nn.Module):
@@ -87,9 +102,20 @@ def export_network(network: GameSR, path: Path, *, name: str, card: dict[str, An
     return card
 
 
-def export_baseline(kernel: str, scale: int, path: Path) -> None:
-    metadata = {"name": kernel, "scale": scale, "size_multiple": 2, "precision": "float32", "state": [], "card": {"interpolation": kernel}}
-    _write(Baseline(kernel, scale).float(), path, None, 1, metadata)
+def export_baseline(name: str, scale: int, path: Path) -> None:
+    """Write one of BASELINES; its card says what it computes."""
+    module: nn.Module
+    if name in FSR1_PASSES:
+        module = Fsr1Baseline(scale, sharpen=name == "fsr1")
+        card = {
+            "algorithm": f"AMD FidelityFX Super Resolution 1.0: {FSR1_PASSES[name]}, on BT.709 limited-range RGB",
+            "note": "made for the shaders of a GPU: its time on a CPU is not its time on a GPU",
+        }
+    else:
+        module = Baseline(name, scale)
+        card = {"interpolation": name}
+    metadata = {"name": name, "scale": scale, "size_multiple": 2, "precision": "float32", "state": [], "card": card}
+    _write(module.float(), path, None, 1, metadata)
 
 
 def state_entry(part: str, channels: int, divisor: int) -> dict[str, object]:
@@ -133,6 +159,8 @@ def _write(module: nn.Module, path: Path, state: State | None, divisor: int, met
         )
     assert program is not None
     model = program.model_proto
+    for node in model.graph.node:
+        del node.metadata_props[:]  # where in whose files each operator was traced: half a megabyte that says nothing to a client
     for key, value in {"gamesr_format": FORMAT_VERSION, **metadata}.items():
         text = value if isinstance(value, str) else json.dumps(value)
         model.metadata_props.append(onnx.StringStringEntryProto(key=key, value=text))
