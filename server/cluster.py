@@ -12,7 +12,7 @@ from server.job import Failed, Job, Outcome, run_job
 if TYPE_CHECKING:
     from distributed import Client
 
-_CONNECT_S = 30
+_CONNECT_S = 10
 _RETRIES = 2
 
 

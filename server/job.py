@@ -25,6 +25,7 @@ from server.points import Flag, Point, PointResult
 
 TOLERANCE = 0.1  # of the bitrate asked for: beyond it the point is flagged
 Item = TypeVar("Item")
+_NOT_PLANNED = "{} is not the file that was planned with: it changed, or is another one on this machine"
 REFUSALS = (GamesrError, MemoryError, OSError)
 
 
@@ -153,7 +154,7 @@ def _encode(job: Job, work: _Work) -> EncodedStream:
     point = job.asks[0].point
     for path, expected in ((job.clip, point.clip_sha256), (job.low, point.low_sha256)):
         if path is not None and content_sha256(path) != expected:
-            raise InputError(f"{path} is not the file that was planned with: it changed, or is another one on this machine")
+            raise InputError(_NOT_PLANNED.format(path))
     with work, closing(low_frames(job)) as frames:
         return EncodedStream(frames, settings(point))
 
@@ -164,7 +165,7 @@ def _measure(job: Job, ask: Ask, stream: EncodedStream, work: _Work) -> PointRes
     with ExitStack() as stack:
         references = stack.enter_context(closing(clip_frames(job.clip, job.step, point.frames)))
         meter = stack.enter_context(QualityMeter(point.width, point.height, vmaf_threads=1))
-        lpips = Lpips(job.lpips, threads=1) if job.lpips else None
+        lpips = _lpips(job.lpips, point) if job.lpips else None
         for index, picture in enumerate(work.each(_pictures(stream, upscaler))):
             with work:
                 reference = next(references, None)
@@ -194,8 +195,15 @@ def _upscaler(ask: Ask) -> OnnxUpscaler | None:
         return None
     upscaler = OnnxUpscaler(ask.model, threads=1)
     if upscaler.spec.sha256 != ask.point.upscaler_sha256:
-        raise ModelError(f"{ask.model} is not the file that was planned with: it changed, or is another one on this machine")
+        raise ModelError(_NOT_PLANNED.format(ask.model))
     return upscaler
+
+
+def _lpips(path: Path, point: Point) -> Lpips:
+    lpips = Lpips(path, threads=1)
+    if lpips.version != point.versions["lpips"]:
+        raise ModelError(_NOT_PLANNED.format(path))
+    return lpips
 
 
 def _pictures(stream: EncodedStream, upscaler: OnnxUpscaler | None) -> Iterator[Frame]:

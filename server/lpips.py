@@ -23,14 +23,14 @@ class Lpips:
     """Distance of two pictures, R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018.
 
     The file has two inputs, reference and measured picture, float32 (1, 3, H, W) of RGB in -1..1, and one output of one
-    number. Frames 0, 10, 20 and so on are compared; the clip's figure is their mean. `sha256` is that of the file. Raises
-    ModelError, in one sentence, for a file that is not of this kind.
+    number. Frames 0, 10, 20 and so on are compared; the clip's figure is their mean. `version` names the file by its sha256,
+    and the frames. Raises ModelError, in one sentence, for a file that is not of this kind.
     """
 
     def __init__(self, path: Path, *, threads: int) -> None:
         self._path = path
         content = _read(path)
-        self.sha256 = hashlib.sha256(content).hexdigest()
+        self.version = f"{hashlib.sha256(content).hexdigest()}, every {EVERY}th frame"
         try:
             self._session = ort.InferenceSession(content, session_options(threads), providers=["CPUExecutionProvider"])
         except Exception as error:  # the runtime's exceptions have no common base
@@ -42,11 +42,12 @@ class Lpips:
         self._distances: list[float] = []
 
     def add(self, index: int, reference: Frame, measured: Frame) -> None:
-        """Compare one pair of frames if its number is due; nothing of them is kept. Raises ModelError where the file does not fit."""
+        """Compare one pair of frames if its number is due; nothing of them is kept. Raises what `distance` raises."""
         if index % EVERY == 0:
             self._distances.append(self.distance(reference, measured))
 
     def distance(self, reference: Frame, measured: Frame) -> float:
+        """Of two pictures of one size; raises ModelError where the file does not fit."""
         pictures = dict(zip(self._names, (_network_input(reference), _network_input(measured)), strict=True))
         try:
             (output,) = self._session.run(None, pictures)

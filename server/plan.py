@@ -8,17 +8,19 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import av
+import numpy as np
 import onnxruntime
 
 from client.artifact import ModelSpec
 from client.cloud import CloudSettings
 from client.errors import InputError, ModelError
+from client.frames import Frame
 from client.models import find_model, shipped_models
 from client.upscaler import OnnxUpscaler
 from client.video import VideoSource
 from client.vmaf import MODELS, why_unavailable
 from server.job import Ask, Job, content_sha256
-from server.lpips import EVERY, Lpips
+from server.lpips import Lpips
 from server.points import NO_UPSCALER, Point
 
 SCALES = (2, 3)
@@ -87,7 +89,7 @@ def make_plan(request: Request) -> Plan:
     names = _names(clips)
     renders = _renders(request, clips)
     upscalers = _Upscalers(request.upscalers)
-    lpips = {"lpips": f"{Lpips(request.lpips, threads=1).sha256}, every {EVERY}th frame"} if request.lpips else {}
+    lpips = {"lpips": _lpips_version(request.lpips, clips)} if request.lpips else {}
     jobs, latency_jobs = [], []
     for clip in clips:
         step = _step(clip, request.fps)
@@ -128,8 +130,6 @@ def make_plan(request: Request) -> Plan:
             jobs += row
             latency_jobs.append(row[len(row) // 2])
     upscalers.check_all_used()
-    if not jobs:
-        raise InputError("there is nothing to measure: name an upscaler, and a height that is half or a third of a clip's")
     # The longest first, so that no worker is left alone with one at the end.
     return Plan(tuple(sorted(jobs, key=lambda job: -len(job.asks))), tuple(latency_jobs))
 
@@ -164,12 +164,16 @@ class _Upscalers:
         return self._by_scale[scale]
 
     def check_all_used(self) -> None:
+        scales: dict[str, list[str]] = {}
         for scale, models in self._by_scale.items():
             for name in models:
-                if name not in self._used:
-                    raise InputError(
-                        f"upscaler {name} upscales by {scale}, and no height that was asked for is a {_PART[scale]} of a clip's"
-                    )
+                scales.setdefault(name, []).append(_PART[scale])
+        for name, parts in scales.items():
+            if name not in self._used:
+                part = " or ".join(f"a {part}" for part in parts)
+                raise InputError(
+                    f"upscaler {name} needs a height that is {part} of a clip's, an even number of pixels each way: see --heights"
+                )
 
 
 _PART = {1: "whole", 2: "half", 3: "third"}
@@ -255,6 +259,16 @@ def _versions(clip: _Clip) -> dict[str, str]:
         "quality": _QUALITY_VERSION,
         "vmaf": f"{', '.join(MODELS.values())}, imageio-ffmpeg {_version('imageio-ffmpeg')}" if missing is None else missing,
     }
+
+
+def _lpips_version(path: Path, clips: Sequence[_Clip]) -> str:
+    """Tried on a grey picture of every size, so that a file which does not fit is refused now."""
+    lpips = Lpips(path, threads=1)
+    for width, height in {(clip.width, clip.height) for clip in clips}:
+        luma, chroma = np.full((height, width), 128, np.uint8), np.full((-(-height // 2), -(-width // 2)), 128, np.uint8)
+        grey = Frame(luma, chroma, chroma)
+        lpips.distance(grey, grey)
+    return lpips.version
 
 
 def _version(package: str) -> str:

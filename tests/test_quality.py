@@ -131,6 +131,25 @@ def test_temporal_error_sees_flicker_and_not_a_constant_error(clean: Clip) -> No
     assert blur.psnr_y_db < noise.psnr_y_db and 0 < blur.temporal_error < noise.temporal_error * 1.5
 
 
+@pytest.mark.parametrize("kind", ["flicker", "blur", "noise"])
+def test_temporal_error_rises_with_flicker_with_noise_and_with_a_blur_of_what_moves(clean: Clip, kind: str) -> None:
+    def worsened(index: int, frame: Frame, strength: int) -> Frame:
+        if kind == "noise":
+            return noisy(frame, 2.0 * strength, index)
+        if kind == "flicker":
+            return with_luma(frame, frame.y + 2.0 * strength * (-1) ** index)
+        for _ in range(strength):
+            frame = blurred(frame)
+        return frame
+
+    moving, still = (
+        [measure(clip, [worsened(i, f, strength) for i, f in enumerate(clip)]).temporal_error or 0 for strength in (1, 2, 4)]
+        for clip in (clean, [clean[0]] * FRAMES)
+    )
+    assert 0 < moving[0] < moving[1] < moving[2]
+    assert still == [0, 0, 0] if kind == "blur" else 0 < still[0] < still[1] < still[2]
+
+
 @pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (107, 61)])
 def test_vmaf_agrees_with_a_plain_run_over_two_files(tmp_path: Path, size: tuple[int, int]) -> None:
     clean = [scene(index, *size) for index in range(FRAMES)]

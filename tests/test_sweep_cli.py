@@ -1,0 +1,168 @@
+"""gamesr-sweep as a user meets it: what it prints and writes, and one sentence for everything that is wrong."""
+
+from __future__ import annotations
+
+import csv
+import json
+import signal
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+from server import cli
+from server.points import PointResult
+from tests.sweeping import plan_of
+
+SMALL = ("--bitrates", "0.2", "--heights", "36", "--jobs", "1")
+
+
+@pytest.fixture
+def clip(make_clip: Callable[..., Path]) -> Path:
+    return make_clip("clip.mkv", width=96, height=72)
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    status = cli.main([str(argument) for argument in arguments])
+    printed = capsys.readouterr()
+    return status, printed.out, printed.err
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """The one sentence of a command that does nothing."""
+    status, out, err = run(capsys, *arguments)
+    assert (status, out) == (1, "") and err.count("\n") == 1 and err.startswith("gamesr-sweep: ") and "Traceback" not in err
+    return err
+
+
+def test_the_command_prints_writes_and_keeps(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = (clip, *SMALL, "--upscalers", "none,bicubic", "--store", tmp_path / "store", "--out", tmp_path / "out")
+    status, out, err = run(capsys, *arguments)
+    assert (status, err) == (0, "") and "harness overhead" in out and "2 points measured, 0 reused, 0 failed" in out
+    assert "no LPIPS" in out and "while nothing else of the sweep ran" in out
+    with (tmp_path / "out/points.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    record = json.loads((tmp_path / "out/sweep.json").read_text())
+    points = [PointResult.from_record({k: v for k, v in point.items() if k != "key"}) for point in record["points"]]
+    assert [row["upscaler"] for row in rows] == [result.point.upscaler for result in points] == ["none", "bicubic"]
+    assert [float(row["vmaf"]) for row in rows] == [result.quality.vmaf for result in points] and rows[0]["lpips"] == ""
+    assert [row["key"] for row in rows] == [result.point.key for result in points] and len(record["latencies"]) == 2
+    assert record["harness"]["work_s"] > 0
+
+    assert "is not empty" in refusal(capsys, *arguments)
+    status, out, _ = run(capsys, *arguments, "--force", "--json")
+    events = [json.loads(line) for line in out.splitlines()]
+    assert status == 0 and [event["event"] for event in events] == [
+        "plan_made",
+        *["point_reused"] * 2,
+        *["latency_reused"] * 2,
+        "sweep_done",
+    ]
+    assert json.loads((tmp_path / "out/sweep.json").read_text())["points"] == record["points"]
+
+
+def test_bad_input_is_one_sentence_before_any_work(
+    clip: Path, make_clip: Callable[..., Path], model_file: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text, copy, store = tmp_path / "text.mkv", tmp_path / "copy.mkv", tmp_path / "store"
+    text.write_text("no video")
+    copy.write_bytes(clip.read_bytes())
+    wide, small = (make_clip(f"{width}x36.mkv", width=width, height=36) for width in (64, 48))
+    odd = make_clip("odd.mkv", width=97, height=72, pix_fmt="yuv444p")
+    short = make_clip("short.mp4", width=48, height=36, frames=5)
+    whole = make_clip("whole.mp4", width=96, height=72)
+    bicubic = model_file("bicubic.onnx")
+    cases: list[tuple[Sequence[object], str]] = [
+        ((tmp_path / "none.mkv",), "does not exist"),
+        ((text,), "is not a video file"),
+        ((clip, copy), "are the same clip"),
+        ((odd, "--heights", "72"), "not an even number of pixels"),
+        ((clip, "--heights", "40"), "neither the whole, nor half, nor a third"),
+        ((clip, "--upscalers", "none,sharpest"), "no model named 'sharpest'"),
+        ((clip, "--upscalers", tmp_path / "none.onnx"), "cannot be read"),
+        ((clip, "--upscalers", f"bicubic,{bicubic}"), "asked for twice"),
+        ((clip, "--upscalers", "none,gamesr-openarena", "--heights", "24"), "gamesr-openarena needs a height that is a half of a clip's"),
+        ((clip, "--upscalers", "bicubic", "--heights", "72"), "bicubic needs a height that is a half or a third"),
+        ((clip, "--fps", "20"), "no whole part"),
+        ((clip, "--render", clip, wide), "which is no whole part"),
+        ((clip, "--render", small, small), "is not one of the clips"),
+        ((whole, "--render", whole, short), "has 5 frames"),
+        ((clip, "--lpips", text), "not a readable ONNX model"),
+        ((clip, "--dask", "nowhere"), "no Dask scheduler"),
+    ]
+    for arguments, sentence in cases:
+        assert sentence in refusal(capsys, *arguments, "--store", store), arguments
+    assert not store.exists() or not sqlite3.connect(store).execute("SELECT 1 FROM points").fetchall()
+    store.write_bytes(b"x" * 5000)
+    assert "not a database" in refusal(capsys, clip, "--store", store)
+    assert "Traceback" in run(capsys, clip, "--store", store, "--debug")[2]
+
+
+def test_rates_that_differ_and_are_not_whole_are_refused(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for rate, sentence in (("25", "25 frames a second and"), ("12.5", "not a whole number")):
+        other = tmp_path / f"{rate}.mkv"
+        command = [imageio_ffmpeg(), "-v", "error", "-f", "lavfi", "-i", f"testsrc2=size=48x36:rate={rate}:duration=1", str(other)]
+        subprocess.run(command, check=True)
+        assert sentence in refusal(capsys, clip, "--render", clip, other, "--store", tmp_path / "store")
+
+
+def imageio_ffmpeg() -> str:
+    import imageio_ffmpeg
+
+    return str(imageio_ffmpeg.get_ffmpeg_exe())
+
+
+def test_what_fails_is_said_at_the_end_and_the_rest_stays(
+    clip: Path, make_clip: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short = make_clip("short.mkv", width=48, height=36, frames=5)
+    arguments = (clip, *SMALL, "--upscalers", "none,bicubic", "--render", clip, short, "--store", tmp_path / "store")
+    status, out, err = run(capsys, *arguments)
+    assert status == 1 and "1 points measured, 0 reused, 1 failed" in out
+    assert "1 points and 1 latencies failed" in err and "not as many frames" in err and err.count("\n") == 1
+
+
+def test_names_stay_apart_where_two_clips_are_called_alike(make_clip: Callable[..., Path], tmp_path: Path) -> None:
+    for folder, frames in (("a", 12), ("b", 11)):
+        (tmp_path / folder).mkdir()
+        make_clip(f"{folder}/clip.mkv", width=96, height=72, frames=frames)
+    names = {point.clip for point in plan_of(tmp_path / "a/clip.mkv", tmp_path / "b/clip.mkv").points}
+    assert names == {str(tmp_path / "a/clip.mkv"), str(tmp_path / "b/clip.mkv")}
+
+
+def test_by_default_every_height_that_fits_is_measured(make_clip: Callable[..., Path]) -> None:
+    both, half = make_clip("both.mkv", width=96, height=72), make_clip("half.mkv", width=104, height=72)
+    points = plan_of(both, half).points
+    assert {(p.clip, p.low_height) for p in points} == {("both", 72), ("both", 36), ("both", 24), ("half", 72), ("half", 36)}
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_it_says_so_and_the_same_command_goes_on(clip: Path, tmp_path: Path, signum: int) -> None:
+    command = [
+        sys.executable,
+        "-c",
+        "from server.cli import main; raise SystemExit(main())",
+        str(clip),
+        "--store",
+        str(tmp_path / "store"),
+        "--json",
+        "--jobs",
+        "2",
+    ]
+    command += ["--upscalers", "none,bicubic,lanczos", "--heights", "36,24"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parent.parent) as process:
+        assert process.stdout is not None and process.stderr is not None
+        kinds = [json.loads(process.stdout.readline())["event"] for _ in range(2)]
+        process.send_signal(signum)
+        said = process.stderr.read()
+    assert kinds == ["plan_made", "point_done"]
+    assert (process.returncode, said) == (
+        130,
+        f"gamesr-sweep: interrupted: what was finished is in {tmp_path / 'store'}, and the same command goes on\n",
+    )
+    with sqlite3.connect(tmp_path / "store") as connection:
+        assert connection.execute("SELECT count(*) FROM points").fetchone()[0] >= 1
+        assert connection.execute("SELECT count(*) FROM claims").fetchone() == (0,)

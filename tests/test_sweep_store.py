@@ -1,0 +1,122 @@
+"""The store: results that stay, claims that end with their owner, and files that are somebody else's."""
+
+from __future__ import annotations
+
+import multiprocessing
+import sqlite3
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from client.errors import OutputError
+from client.quality import Quality
+from server.points import Point, PointResult
+from server.store import SCHEMA_VERSION, Store
+from tests.sweeping import some_latency
+
+
+def result(number: int, text: str = "") -> PointResult:
+    point = Point("clip", f"{number}", 64, 48, 30, None, 24, None, 200, {"threads": 1}, "bicubic", "b", {"av": text})
+    return PointResult(point, 201.5, (), Quality(3, psnr_y_db=30.25, undefined={"vmaf": "none"}), None, "none")
+
+
+def test_what_is_kept_is_there_for_the_next_and_the_first_of_two_stays(tmp_path: Path) -> None:
+    with Store(tmp_path / "store") as store:
+        store.keep_point(result(1))
+        store.keep_point(replace(result(1), bitrate_kbps=0.0))
+        store.keep_latency("key", some_latency())
+    with Store(tmp_path / "store") as store:
+        assert store.point(result(1).point.key) == result(1) and store.point("other") is None
+        assert store.latency("key") == some_latency() and store.latency("other") is None
+        with sqlite3.connect(tmp_path / "store") as connection:
+            assert connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+            assert connection.execute("PRAGMA user_version").fetchone() == (SCHEMA_VERSION,)
+
+
+def test_a_claim_is_one_sweeps_until_it_is_given_back_or_its_sweep_is_gone(tmp_path: Path) -> None:
+    with Store(tmp_path / "store") as one:
+        with Store(tmp_path / "store") as two:
+            assert one.claim(["a", "b"]) == ["a", "b"]
+            assert two.claim(["a", "b", "c"]) == ["c"] and two.claim(["c"]) == []
+            two.release("a")  # not its own
+            one.release("b")
+            assert two.claim(["a", "b"]) == ["b"]
+        assert one.claim(["b", "c"]) == ["b", "c"]
+
+
+def test_a_stored_point_is_claimed_by_nobody(tmp_path: Path) -> None:
+    with Store(tmp_path / "store") as one, Store(tmp_path / "store") as two:
+        key = result(1).point.key
+        assert one.claim([key]) == [key]
+        one.keep_point(result(1))
+        assert one.claim([key]) == two.claim([key]) == []
+
+
+def test_alone_means_that_nobody_computes_and_nobody_begins(tmp_path: Path) -> None:
+    with Store(tmp_path / "store") as one, Store(tmp_path / "store") as two:
+        one.claim(["a"])
+        assert not two.claim_alone()
+        one.release("a")
+        assert two.claim_alone() and not one.claim_alone() and one.claim(["a"]) == []
+        two.release_alone()
+        assert one.claim(["a"]) == ["a"]
+
+
+def test_a_lease_is_renewed_while_its_sweep_lives_and_runs_out_when_it_is_killed(tmp_path: Path) -> None:
+    with Store(tmp_path / "store", lease_s=1.0) as one, Store(tmp_path / "store") as two:
+        one.claim(["a"])
+        time.sleep(1.5)
+        assert two.claim(["a"]) == []
+        one._closing.set()  # what a kill does to the thread
+        one._heartbeat.join()
+        time.sleep(1.1)
+        assert two.claim(["a"]) == ["a"]
+
+
+def open_and_claim(path: Path) -> None:
+    with Store(path) as store:
+        for number in range(30):
+            for key in store.claim([str(number)]):
+                store.keep_point(result(int(key)))
+
+
+def test_many_may_create_and_fill_it_at_once(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("spawn")
+    processes = [context.Process(target=open_and_claim, args=(tmp_path / "store",)) for _ in range(4)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    assert [process.exitcode for process in processes] == [0] * 4
+    with Store(tmp_path / "store") as store:
+        assert all(store.point(result(number).point.key) for number in range(30))
+
+
+def test_another_schema_version_another_database_and_no_database_are_refused_untouched(tmp_path: Path) -> None:
+    newer, other, text = (tmp_path / name for name in ("newer", "other", "text"))
+    Store(newer).__exit__(None, None, None)
+    for path, statement in ((newer, f"PRAGMA user_version = {SCHEMA_VERSION + 1}"), (other, "CREATE TABLE mine (x)")):
+        with sqlite3.connect(path) as connection:
+            connection.execute(statement)
+    text.write_text("no database" * 500)
+    for path, sentence in ((newer, "schema version 2, not 1"), (other, "not of gamesr-sweep"), (text, "not a database")):
+        before = path.read_bytes()
+        with pytest.raises(OutputError, match=sentence) as caught:
+            Store(path)
+        assert str(path) in str(caught.value) and "\n" not in str(caught.value) and path.read_bytes() == before
+    with pytest.raises(OutputError, match="unable to open"):
+        Store(tmp_path / "no folder" / "store")
+
+
+def test_no_space_left_is_one_sentence_and_what_was_kept_stays(tmp_path: Path) -> None:
+    with Store(tmp_path / "store") as store:
+        (pages,) = store._connection.execute("PRAGMA page_count").fetchone()
+        store._connection.execute(f"PRAGMA max_page_count = {pages + 8}")
+        kept = 0
+        with pytest.raises(OutputError, match="full"):
+            for kept in range(1000):
+                store.keep_point(result(kept, "x" * 1000))
+    with Store(tmp_path / "store") as store:
+        assert kept > 2 and [store.point(result(n, "x" * 1000).point.key) is not None for n in range(kept + 1)] == [True] * kept + [False]
