@@ -24,18 +24,22 @@ Figure = float | Undefined
 
 @dataclass(frozen=True)
 class Curve:
-    """Quality over true bitrate, by rising bitrate; `name` and `metric` are what the reasons call it and its quality."""
+    """Quality over true bitrate, by rising bitrate; `name` and `metric` are what the reasons call it and its quality.
+
+    `missing` says why a point of it has no quality; nothing is then computed from the others.
+    """
 
     name: str
     metric: str
     bitrates_kbps: tuple[float, ...]
     qualities: tuple[float, ...]
+    missing: str | None = None
 
     @classmethod
-    def through(cls, name: str, metric: str, points: Iterable[tuple[float, float]]) -> Curve:
+    def through(cls, name: str, metric: str, points: Iterable[tuple[float, float]], missing: str | None = None) -> Curve:
         """A curve of (bitrate, quality) points in any order."""
         ordered = sorted(points)
-        return cls(name, metric, tuple(rate for rate, _ in ordered), tuple(quality for _, quality in ordered))
+        return cls(name, metric, tuple(rate for rate, _ in ordered), tuple(quality for _, quality in ordered), missing)
 
 
 def bd_rate(anchor: Curve, test: Curve) -> Figure:
@@ -82,12 +86,12 @@ def bitrate_at(curve: Curve, quality: float) -> Figure:
 
 
 def saving(anchor: Curve, test: Curve, quality: float) -> Figure:
-    """Percent of the bits of `anchor` at a quality that `test` saves (negative: it takes more)."""
-    rates = bitrate_at(anchor, quality), bitrate_at(test, quality)
-    reasons = [rate.reason for rate in rates if isinstance(rate, Undefined)]
-    if reasons:
-        return Undefined("; ".join(reasons))
-    before, after = (rate for rate in rates if not isinstance(rate, Undefined))
+    """Percent of the bits of `anchor` at a quality that `test` saves (negative: it takes more); one reason where both have one."""
+    after, before = bitrate_at(test, quality), bitrate_at(anchor, quality)
+    if isinstance(after, Undefined):
+        return after
+    if isinstance(before, Undefined):
+        return before
     return 100 * (1 - after / before)
 
 
@@ -107,6 +111,8 @@ def _incomparable(anchor: Curve, test: Curve) -> Undefined | None:
 
 def _malformed(curve: Curve) -> Undefined | None:
     """Why nothing can be interpolated on this curve."""
+    if curve.missing is not None:
+        return Undefined(f"{curve.name} has no {curve.metric}: {curve.missing}")
     if len(curve.qualities) < LEAST_POINTS:
         return Undefined(f"{curve.name} has {len(curve.qualities)} points, fewer than {LEAST_POINTS}")
     for index in range(1, len(curve.qualities)):

@@ -1,0 +1,75 @@
+"""Pictures of a sweep: the same every time, all curves and lines there, names that do not touch."""
+
+from __future__ import annotations
+
+import io
+import xml.etree.ElementTree as ET
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from server.plots import _apart, latency_figure, rd_figures, rendered
+from server.points import PointResult
+from tests.measured import latency_results, point_result, sweep_results, with_quality
+
+
+def svg_of(name: str, points: list[PointResult]) -> str:
+    return rendered(dict(rd_figures(points))[name], "svg").decode()
+
+
+def test_a_figure_for_every_metric_and_height() -> None:
+    names = [name for name, _ in rd_figures(sweep_results(("map",)))]
+    assert names == [f"rd_{metric}_{height}p" for metric in ("vmaf", "vmaf_neg", "psnr_y") for height in (540, 360)]
+
+
+def test_every_curve_grade_and_clip_is_there() -> None:
+    svg = svg_of("rd_vmaf_540p", sweep_results())
+    ET.fromstring(svg)
+    for text in ("native", "bicubic", "lanczos", "easu", "fsr1", "gamesr", "fair 70", "good 80", "excellent 90"):
+        assert svg.count(f"<!-- {text} -->") == 2, text
+    assert "<!-- map, 540p to 1080p -->" in svg and "<!-- track, 540p to 1080p -->" in svg
+    assert "<!-- fair 70 -->" not in svg_of("rd_psnr_y_540p", sweep_results(("map",), (540,)))
+
+
+def test_the_same_points_give_the_same_files() -> None:
+    points, latencies = sweep_results(("map",), (540,)), latency_results(("map",))
+    for kind in ("svg", "png"):
+        first, again = (rendered(next(rd_figures(points))[1], kind) for _ in range(2))
+        assert first == again
+        assert rendered(latency_figure(latencies), kind) == rendered(latency_figure(latencies), kind)
+
+
+def test_a_png_is_wide_enough_to_read() -> None:
+    picture = Image.open(io.BytesIO(rendered(next(rd_figures(sweep_results()))[1], "png")))
+    assert picture.width > 1500
+
+
+def test_latency_shows_both_deadlines_and_every_upscaler() -> None:
+    svg = rendered(latency_figure(latency_results(("map",))), "svg").decode()
+    for text in ("60 fps", "120 fps", "native 1080p", "fsr1 360p", "2.1 / 3.0"):
+        assert f"<!-- {text} -->" in svg, text
+
+
+def test_a_figure_that_no_point_has_leaves_its_panels_empty() -> None:
+    points = sweep_results(("map",), (540,))
+    bare = [
+        with_quality(point, vmaf=None, vmaf_neg=None, undefined={"vmaf": "not asked for", "vmaf_neg": "not asked for"}) for point in points
+    ]
+    assert "<!-- gamesr -->" not in svg_of("rd_vmaf_540p", bare)
+
+
+def test_native_alone_has_no_figure() -> None:
+    assert list(rd_figures([point_result("map", "none", 1080, 2000)])) == []
+
+
+@given(st.lists(st.floats(0, 100), min_size=1, max_size=12).map(sorted), st.floats(0.5, 10))
+def test_names_keep_their_order_and_their_distance(wanted: list[float], step: float) -> None:
+    places = _apart(wanted, step)
+    assert len(places) == len(wanted)
+    assert all(after - before >= step - 1e-6 for before, after in pairwise(places))
+    assert sum(places) == pytest.approx(sum(wanted))
+    if all(after - before >= step for before, after in pairwise(wanted)):
+        assert places == pytest.approx(wanted)
