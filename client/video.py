@@ -74,6 +74,7 @@ class VideoSource:
         duration_us = self._container.duration
         self.estimated_frames = self.announced_frames or (round(duration_us * self.frame_rate / 1_000_000) if duration_us else None)
         self._damaged = False
+        self._begun = False
 
     def __enter__(self) -> Self:
         return self
@@ -116,7 +117,8 @@ class VideoSource:
         if picture.interlaced_frame:
             raise InputError(f"{self.path} is interlaced, which is not supported: deinterlace it first")
         _check_size(self.path, picture.width, picture.height)
-        if self.display_matrix is None:
+        if not self._begun:  # of later ones too it would make a cycle of references, which keeps pictures until a garbage collection
+            self._begun = True
             self.display_matrix = _display_matrix(picture)
         if picture.is_corrupt:
             self._damaged = True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from av.video.frame import VideoFrame
 
 from client.chroma import halve_rows, halve_rows_and_columns
 from client.errors import InputError
@@ -36,6 +38,17 @@ def test_every_frame_comes_out_once_and_in_order(make_clip: MakeClip, options: d
     assert errors == 0
     assert [frame.pts * frame.time_base for frame in frames] == [Fraction(p, 30) for p in pts]
     assert not any(frame.damaged for frame in frames)
+
+
+def test_a_picture_is_freed_without_the_garbage_collector(make_clip: MakeClip) -> None:
+    gc.collect()
+    gc.disable()
+    try:
+        for frame in read_frames(make_clip()):
+            assert frame.height == HEIGHT
+            assert sum(isinstance(thing, VideoFrame) for thing in gc.get_objects()) <= 3
+    finally:
+        gc.enable()
 
 
 def test_source_says_what_it_holds(make_clip: MakeClip) -> None:
