@@ -142,7 +142,7 @@ def _label_ends(axis: Axes, ends: list[tuple[float, float, str, str]]) -> None:
     """Each curve's name beside the panel, as near to its last point as the names below and above leave it room."""
     low, high = axis.get_ylim()
     step = _NAME_HEIGHT * (high - low)
-    for (quality, rate, label, colour), place in zip(ends, _apart([end[0] for end in ends], step), strict=True):
+    for (quality, rate, label, colour), place in zip(ends, _apart([end[0] for end in ends], step, high), strict=True):
         axis.annotate(
             label,
             (rate, quality),
@@ -155,14 +155,15 @@ def _label_ends(axis: Axes, ends: list[tuple[float, float, str, str]]) -> None:
         )
 
 
-def _apart(wanted: Sequence[float], step: float) -> list[float]:
-    """The places nearest to rising wanted ones, in the mean square, of which no two are closer than `step`."""
+def _apart(wanted: Sequence[float], step: float, top: float) -> list[float]:
+    """The places nearest to rising wanted ones, in the mean square, no two closer than `step` and none above `top`."""
     groups: list[list[float]] = []  # of neighbours that touch, each value with the room of those before it taken off
     for index, place in enumerate(wanted):
         groups.append([place - index * step])
         while len(groups) > 1 and fmean(groups[-1]) < fmean(groups[-2]):
             groups[-2:] = [groups[-2] + groups[-1]]
-    return [fmean(group) + index * step for index, group in enumerate(group for group in groups for _ in group)]
+    highest = top - (len(wanted) - 1) * step
+    return [min(fmean(group), highest) + index * step for index, group in enumerate(group for group in groups for _ in group)]
 
 
 def _draw_latency(axis: Axes, clip: str, latencies: Sequence[LatencyResult]) -> None:

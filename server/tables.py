@@ -10,19 +10,19 @@ from server.document import Table
 from server.points import DEADLINES_FPS, NO_UPSCALER, LatencyResult
 
 _NOTHING = "-"
-_POINT_FIGURES = {
-    "PSNR-Y": ("psnr_y_db", ".2f"),
-    "U": ("psnr_u_db", ".2f"),
-    "V": ("psnr_v_db", ".2f"),
-    "SSIM-Y": ("ssim_y", ".4f"),
-    "VMAF": ("vmaf", ".1f"),
-    "harmonic": ("vmaf_harmonic_mean", ".1f"),
-    "5%": ("vmaf_p5", ".1f"),
-    "NEG": ("vmaf_neg", ".1f"),
-    "harmonic ": ("vmaf_neg_harmonic_mean", ".1f"),
-    "5% ": ("vmaf_neg_p5", ".1f"),
-    "temporal": ("temporal_error", ".2f"),
-}
+_POINT_FIGURES = (
+    ("PSNR-Y", "psnr_y_db", "{:.2f}"),
+    ("U", "psnr_u_db", "{:.2f}"),
+    ("V", "psnr_v_db", "{:.2f}"),
+    ("SSIM-Y", "ssim_y", "{:.4f}"),
+    ("VMAF", "vmaf", "{:.1f}"),
+    ("harmonic", "vmaf_harmonic_mean", "{:.1f}"),
+    ("5%", "vmaf_p5", "{:.1f}"),
+    ("VMAF-NEG", "vmaf_neg", "{:.1f}"),
+    ("harmonic", "vmaf_neg_harmonic_mean", "{:.1f}"),
+    ("5%", "vmaf_neg_p5", "{:.1f}"),
+    ("temporal error", "temporal_error", "{:.2f}"),
+)
 
 
 class Notes:
@@ -32,7 +32,8 @@ class Notes:
         self._numbers: dict[str, int] = {}
 
     def cell(self, figure: Figure, form: str) -> str:
-        return self.refer(figure.reason) if isinstance(figure, Undefined) else format(figure, form)
+        """The figure in a form of str.format, or the number of its reason."""
+        return self.refer(figure.reason) if isinstance(figure, Undefined) else form.format(figure)
 
     def refer(self, reason: str) -> str:
         return f"({self._numbers.setdefault(reason, len(self._numbers) + 1)})"
@@ -50,8 +51,8 @@ def bd_table(of_clip: Sequence[Series], notes: Notes) -> Table:
 
 
 def _bd_row(comparison: Comparison, notes: Notes) -> list[str]:
-    rates = [notes.cell(figure, "+.1f") + ("" if isinstance(figure, Undefined) else "%") for figure in comparison.bd_rate_percent.values()]
-    qualities = [notes.cell(figure, "+.2f") for figure in comparison.bd_quality.values()]
+    rates = [notes.cell(figure, "{:+.1f}%") for figure in comparison.bd_rate_percent.values()]
+    qualities = [notes.cell(figure, "{:+.2f}") for figure in comparison.bd_quality.values()]
     if isinstance(comparison.bd_rate_percent["vmaf"], Undefined):
         extent = _NOTHING
     else:
@@ -70,10 +71,10 @@ def _saving_cells(series: Series, of_clip: Sequence[Series], notes: Notes) -> li
     against = {anchor.upscaler: compare(series, anchor) for anchor in anchors(series, of_clip)}
     cells = []
     for grade in GRADES:
-        cells.append(notes.cell(bitrate_at(series.curve("vmaf"), grade), ".0f"))
+        cells.append(notes.cell(bitrate_at(series.curve("vmaf"), grade), "{:.0f}"))
         for name in (NO_UPSCALER, BASELINE):
             figure = against[name].saving_percent[grade] if name in against else None
-            cells.append(_NOTHING if figure is None else notes.cell(figure, ".1f") + ("" if isinstance(figure, Undefined) else "%"))
+            cells.append(_NOTHING if figure is None else notes.cell(figure, "{:.1f}%"))
     return cells
 
 
@@ -98,15 +99,15 @@ def points_table(of_clip: Sequence[Series], notes: Notes) -> Table:
     """Every point: what was asked of the encoder, what came, and how good it was."""
     results = [(series.name, result) for series in of_clip for result in series.results]
     measured = any(result.lpips is not None for _, result in results)
-    heads = ["upscaler", "asked kbps", "kbps", *(head.strip() for head in _POINT_FIGURES), *(["LPIPS"] if measured else [])]
+    heads = ["upscaler", "asked kbps", "kbps", *(head for head, _, _ in _POINT_FIGURES), *(["LPIPS"] if measured else [])]
     rows = []
     for name, result in results:
         quality = result.quality
         flags = "".join(notes.refer(flag.value) for flag in result.flags)
         cells = [name, str(result.point.requested_kbps), f"{result.bitrate_kbps:.0f}{flags}"]
-        for field, form in _POINT_FIGURES.values():
+        for _, field, form in _POINT_FIGURES:
             reason = quality.undefined.get(field)
-            cells.append(format(getattr(quality, field), form) if reason is None else notes.refer(reason))
+            cells.append(form.format(getattr(quality, field)) if reason is None else notes.refer(reason))
         if measured:
             cells.append(notes.refer(str(result.lpips_undefined)) if result.lpips is None else f"{result.lpips:.4f}")
         rows.append(cells)

@@ -66,10 +66,10 @@ def test_native_alone_has_no_figure() -> None:
 
 
 @given(st.lists(st.floats(0, 100), min_size=1, max_size=12).map(sorted), st.floats(0.5, 10))
-def test_names_keep_their_order_and_their_distance(wanted: list[float], step: float) -> None:
-    places = _apart(wanted, step)
-    assert len(places) == len(wanted)
+def test_names_keep_their_order_their_distance_and_below_the_top(wanted: list[float], step: float) -> None:
+    places = _apart(wanted, step, top=100.0)
+    assert len(places) == len(wanted) and max(places) <= 100 + 1e-6
     assert all(after - before >= step - 1e-6 for before, after in pairwise(places))
-    assert sum(places) == pytest.approx(sum(wanted))
     if all(after - before >= step for before, after in pairwise(wanted)):
         assert places == pytest.approx(wanted)
+    assert sum(_apart(wanted, step, top=1000.0)) == pytest.approx(sum(wanted))
