@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
@@ -108,6 +109,7 @@ def _windowed(images: Image) -> Iterator[Image]:
         yield rest @ _band(rest.shape[2] - reach).T
 
 
+@functools.cache
 def _band(count: int) -> Image:
     """(count, count + 10): row i holds the Gaussian from column i on."""
     offsets = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
