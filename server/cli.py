@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 import signal
 import sys
 import traceback
 from collections.abc import Sequence
 from contextlib import ExitStack
+from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 
@@ -77,7 +79,7 @@ def parser() -> argparse.ArgumentParser:
         "--upscalers",
         metavar="NAME|FILE,...",
         type=_names,
-        default="none,bicubic,lanczos,gamesr",
+        default="none,bicubic,lanczos,fsr1,gamesr",
         help="shipped models or .onnx files; none is the clip itself at full size (default: %(default)s)",
     )
     parser.add_argument(
@@ -104,7 +106,9 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--store", metavar="FILE", type=Path, default=Path("gamesr-sweep.sqlite"), help="where results are kept (default: %(default)s)"
     )
-    parser.add_argument("--out", metavar="DIR", type=Path, help="write points.csv and sweep.json into this folder")
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, help="write the report (HTML, Markdown, SVG, PNG), points.csv and sweep.json here"
+    )
     parser.add_argument("--force", action="store_true", help="write into a folder that is not empty")
     parser.add_argument("--json", action="store_true", help="print every event as one line of JSON instead of the summary")
     parser.add_argument("--debug", action="store_true", help="show where an error came from")
@@ -114,10 +118,11 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     arguments = parser().parse_args(argv)
+    command = shlex.join([PROGRAM, *(sys.argv[1:] if argv is None else argv)])
     for signum in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signum, _interrupt)
     try:
-        failures = sweep(arguments)
+        failures = sweep(arguments, command)
     except KeyboardInterrupt:
         return _fail(f"interrupted: what was finished is in {arguments.store}, and the same command goes on", 130)
     except GamesrError as error:
@@ -136,8 +141,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def sweep(arguments: argparse.Namespace) -> list[PointFailed | LatencyFailed]:
-    """Everything between the arguments and what is printed; returns what failed. Raises GamesrError."""
+def sweep(arguments: argparse.Namespace, command: str) -> list[PointFailed | LatencyFailed]:
+    """Everything between the arguments and what is printed and written; returns what failed. Raises GamesrError."""
     _prepare(arguments.out, arguments.force)
     request = Request(
         clips=arguments.clips,
@@ -162,9 +167,8 @@ def sweep(arguments: argparse.Namespace) -> list[PointFailed | LatencyFailed]:
                 print(json.dumps(event_record(event), allow_nan=False), flush=True)
     if not arguments.json:
         print(summary(found.points, found.latencies, found.done), flush=True)
-    if arguments.out:
-        write_whole(arguments.out / "points.csv", points_csv(found.points))
-        write_whole(arguments.out / "sweep.json", sweep_json(found.points, found.latencies, found.done))
+    if arguments.out and found.points:
+        _write(arguments.out, found, command)
     return found.failures
 
 
@@ -194,15 +198,26 @@ class _Found:
 
 
 def _prepare(out: Path | None, force: bool) -> None:
-    """The folder is there, and empty or given up, before hours of work go into what is to be written there."""
+    """All is there that writing needs, and the folder empty or given up, before hours of work go into what is to be written."""
     if out is None:
         return
+    missing = [name for name in ("bjontegaard", "matplotlib") if find_spec(name) is None]
+    if missing:
+        raise OutputError(f"the report of --out needs {' and '.join(missing)}: pip install 'gamesr[sweep]'")
     try:
         out.mkdir(parents=True, exist_ok=True)
         if any(out.iterdir()) and not force:
             raise OutputError(f"{out} is not empty: name another folder with --out, or replace what is in it with --force")
     except OSError as error:
         raise OutputError(f"cannot write into {out}: {error.strerror}") from error
+
+
+def _write(out: Path, found: _Found, command: str) -> None:
+    from server.report import write_report  # not above: every worker would load a drawing library
+
+    write_whole(out / "points.csv", points_csv(found.points))
+    write_whole(out / "sweep.json", sweep_json(found.points, found.latencies, found.done))
+    write_report(out, found.points, found.latencies, command=command)
 
 
 def _names(text: str) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import signal
 import sqlite3
@@ -14,8 +15,10 @@ from pathlib import Path
 import pytest
 
 from server import cli
+from server.events import Waiting
 from server.points import PointResult
-from tests.sweeping import plan_of
+from server.progress import SweepProgress
+from tests.sweeping import plan_of, sweep_here
 
 SMALL = ("--bitrates", "0.2", "--heights", "36", "--jobs", "1")
 
@@ -51,8 +54,12 @@ def test_the_command_prints_writes_and_keeps(clip: Path, tmp_path: Path, capsys:
     assert [float(row["vmaf"]) for row in rows] == [result.quality.vmaf for result in points] and rows[0]["lpips"] == ""
     assert [row["key"] for row in rows] == [result.point.key for result in points] and len(record["latencies"]) == 2
     assert record["harness"]["work_s"] > 0
+    assert f"gamesr-sweep {clip} --bitrates 0.2" in (tmp_path / "out/report.md").read_text() and (tmp_path / "out/report.html").is_file()
 
     assert "is not empty" in refusal(capsys, *arguments)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "find_spec", lambda name: None)
+        assert "pip install 'gamesr[sweep]'" in refusal(capsys, *arguments, "--force")
     status, out, _ = run(capsys, *arguments, "--force", "--json")
     events = [json.loads(line) for line in out.splitlines()]
     assert status == 0 and [event["event"] for event in events] == [
@@ -166,3 +173,19 @@ def test_interrupted_it_says_so_and_the_same_command_goes_on(clip: Path, tmp_pat
     with sqlite3.connect(tmp_path / "store") as connection:
         assert connection.execute("SELECT count(*) FROM points").fetchone()[0] >= 1
         assert connection.execute("SELECT count(*) FROM claims").fetchone() == (0,)
+
+
+def test_a_terminal_is_shown_how_far_it_is(clip: Path, tmp_path: Path) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    screen, file = Terminal(), io.StringIO()
+    events = sweep_here(plan_of(clip, heights=[36], bitrates=[200]), tmp_path / "store")
+    for stream in (screen, file):
+        with SweepProgress(stream) as progress:
+            for event in (*events[:2], Waiting("another sweep"), *events[2:]):
+                progress.show(event)
+    lines = screen.getvalue().split("\r\x1b[K")
+    assert lines[1] == "0/2 points" and lines[2].startswith("1/2 points, 0:00 left") and lines[3].endswith("left, waiting: another sweep")
+    assert lines[4] == "2 points, 0/0 latencies" and lines[-1] == "" and file.getvalue() == ""
