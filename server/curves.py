@@ -13,6 +13,11 @@ GRADES = {70: "fair", 80: "good", 90: "excellent"}  # what VMAF is taken for
 BASELINE = "bicubic"
 
 
+def label(upscaler: str) -> str:
+    """What people call it: no upscaler is native resolution."""
+    return "native" if upscaler == NO_UPSCALER else upscaler
+
+
 @dataclass(frozen=True)
 class Series:
     """The points of one upscaler at one height of one clip, by rising bitrate."""
@@ -23,7 +28,7 @@ class Series:
 
     @property
     def label(self) -> str:
-        return "native" if self.upscaler == NO_UPSCALER else self.upscaler
+        return label(self.upscaler)
 
     @property
     def name(self) -> str:

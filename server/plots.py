@@ -12,9 +12,9 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
 
-from server.curves import GRADES, METRICS, Series, series_by_clip
+from server.curves import GRADES, METRICS, Series, label, series_by_clip
 from server.points import NO_UPSCALER, LatencyResult, PointResult
 
 # M. Okabe and K. Ito, "Color Universal Design", 2008, without the yellow, which is too pale for a line on white.
@@ -32,12 +32,16 @@ _LEAST_MS = 0.5  # where the axis of latencies begins
 
 
 def rd_figures(results: Sequence[PointResult]) -> Iterator[tuple[str, Figure]]:
-    """A figure for every metric and encoded height, with its name: one panel a clip, native resolution in each of them."""
+    """A figure for every metric and encoded height, with its name: one panel a clip that has it, with native resolution."""
     clips = series_by_clip(results)
     heights = {series.low_height: None for of_clip in clips.values() for series in of_clip if series.upscaler != NO_UPSCALER}
     styles = _styles([series.label for of_clip in clips.values() for series in of_clip])
     for metric, low_height in product(METRICS, heights):
-        panels = {clip: [s for s in of_clip if s.upscaler == NO_UPSCALER or s.low_height == low_height] for clip, of_clip in clips.items()}
+        panels = {
+            clip: [series for series in of_clip if series.upscaler == NO_UPSCALER or series.low_height == low_height]
+            for clip, of_clip in clips.items()
+            if any(series.upscaler != NO_UPSCALER and series.low_height == low_height for series in of_clip)
+        }
         with _look():
             figure, axes = _panels(len(panels))
             for axis, (clip, of_clip) in zip(axes, panels.items(), strict=True):
@@ -75,6 +79,7 @@ def _look() -> AbstractContextManager[None]:
             "axes.titlesize": 10,
             "axes.titlelocation": "left",
             "axes.titleweight": "bold",
+            "text.parse_math": False,  # a clip's name may hold dollars
             "svg.hashsalt": "gamesr",  # the names of parts in an SVG are random without it
         }
     )
@@ -142,9 +147,9 @@ def _label_ends(axis: Axes, ends: list[tuple[float, float, str, str]]) -> None:
     """Each curve's name beside the panel, as near to its last point as the names below and above leave it room."""
     low, high = axis.get_ylim()
     step = _NAME_HEIGHT * (high - low)
-    for (quality, rate, label, colour), place in zip(ends, _apart([end[0] for end in ends], step, high), strict=True):
+    for (quality, rate, name, colour), place in zip(ends, _apart([end[0] for end in ends], step, high), strict=True):
         axis.annotate(
-            label,
+            name,
             (rate, quality),
             xytext=(1.05, (place - low) / (high - low)),
             textcoords="axes fraction",
@@ -167,7 +172,7 @@ def _apart(wanted: Sequence[float], step: float, top: float) -> list[float]:
 
 
 def _draw_latency(axis: Axes, clip: str, latencies: Sequence[LatencyResult]) -> None:
-    names = [f"{'native' if item.upscaler == NO_UPSCALER else item.upscaler} {item.low_height}p" for item in latencies]
+    names = [f"{label(item.upscaler)} {item.low_height}p" for item in latencies]
     totals = [item.latency_us["total"] for item in latencies]
     rows = range(len(latencies))
     p50, p95 = [total.p50 / 1000 for total in totals], [total.p95 / 1000 for total in totals]
@@ -200,5 +205,6 @@ def _draw_latency(axis: Axes, clip: str, latencies: Sequence[LatencyResult]) -> 
     axis.set_yticks(rows, names)
     axis.invert_yaxis()
     axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
     axis.set_title(clip, pad=14)
     axis.set_xlabel("one frame, decode to write, ms: p50 (dark) / p95 (pale)")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from server.bdrate import Figure, Undefined, bitrate_at, shared
-from server.curves import BASELINE, GRADES, METRICS, Comparison, Series, anchors, compare
+from server.curves import BASELINE, GRADES, METRICS, Comparison, Series, anchors, compare, label
 from server.document import Table
 from server.points import DEADLINES_FPS, NO_UPSCALER, LatencyResult
 
@@ -86,7 +86,7 @@ def latency_table(latencies: Sequence[LatencyResult]) -> Table:
 
 
 def _latency_row(latency: LatencyResult) -> list[str]:
-    cells = [f"{'native' if latency.upscaler == NO_UPSCALER else latency.upscaler} {latency.low_height}p", f"{latency.bitrate_kbps:.0f}"]
+    cells = [f"{label(latency.upscaler)} {latency.low_height}p", f"{latency.bitrate_kbps:.0f}"]
     for stage in ("decode", "upscale"):
         summary = latency.latency_us.get(stage)
         cells += [_NOTHING] * 2 if summary is None else [f"{us / 1000:.2f}" for us in (summary.p50, summary.p95)]

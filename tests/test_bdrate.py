@@ -42,7 +42,7 @@ def reason(figure: Figure) -> str:
 
 @pytest.mark.parametrize(("anchor", "test", "expected"), JCTVC)
 def test_bd_rate_is_that_of_the_spreadsheet(anchor: list[tuple[float, float]], test: list[tuple[float, float]], expected: float) -> None:
-    assert number(bd_rate(curve(anchor), curve(test))) == pytest.approx(expected, abs=1e-2)
+    assert number(bd_rate(curve(anchor), curve(test))) == pytest.approx(expected, abs=1e-9)
 
 
 def test_bd_rate_where_curves_share_little() -> None:

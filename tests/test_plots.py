@@ -61,6 +61,12 @@ def test_a_figure_that_no_point_has_leaves_its_panels_empty() -> None:
     assert "<!-- gamesr -->" not in svg_of("rd_vmaf_540p", bare)
 
 
+def test_a_panel_for_the_clips_that_have_the_height_whatever_they_are_called() -> None:
+    points = [*sweep_results(("map",), (540,)), *sweep_results(("a$b_{$c",), (360,))]
+    svg = svg_of("rd_vmaf_360p", points)
+    assert "<!-- a$b_{$c, 360p to 1080p -->" in svg and "<!-- map" not in svg
+
+
 def test_native_alone_has_no_figure() -> None:
     assert list(rd_figures([point_result("map", "none", 1080, 2000)])) == []
 
