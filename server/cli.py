@@ -10,7 +10,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
@@ -136,8 +136,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if failures:
         if arguments.debug:
             print(failures[0].trace, file=sys.stderr)
-        points = sum(isinstance(failure, PointFailed) for failure in failures)
-        return _fail(f"{points} points and {len(failures) - points} latencies failed, the first one so: {failures[0].reason}", 1)
+        return _fail(f"{len(failures)} points or latencies could not be measured, the first one because {failures[0].reason}", 1)
     return 0
 
 
@@ -160,7 +159,7 @@ def sweep(arguments: argparse.Namespace, command: str) -> list[PointFailed | Lat
         store = stack.enter_context(Store(arguments.store))
         workers: Workers = stack.enter_context(DaskWorkers(arguments.dask)) if arguments.dask else LocalWorkers(arguments.jobs)
         progress = stack.enter_context(SweepProgress(sys.stderr))
-        for event in run_sweep(plan, store, workers):
+        for event in stack.enter_context(closing(run_sweep(plan, store, workers))):
             found.take(event)
             progress.show(event)
             if arguments.json:

@@ -22,8 +22,10 @@ from client.upscaler import OnnxUpscaler
 from server.encoding import EncodedStream, clip_frames
 from server.lpips import Lpips
 from server.points import Flag, Point, PointResult
+from server.versions import versions
 
-TOLERANCE = 0.1  # of the bitrate asked for: beyond it the point is flagged
+# Of the bitrate asked for: beyond it the point is flagged. Within it lies what rate control is off by on a clip of a second.
+TOLERANCE = 0.1
 Item = TypeVar("Item")
 _NOT_PLANNED = "{} is not the file that was planned with: it changed, or is another one on this machine"
 REFUSALS = (GamesrError, MemoryError, OSError)
@@ -155,6 +157,9 @@ def _encode(job: Job, work: _Work) -> EncodedStream:
     for path, expected in ((job.clip, point.clip_sha256), (job.low, point.low_sha256)):
         if path is not None and content_sha256(path) != expected:
             raise InputError(_NOT_PLANNED.format(path))
+    for name, version in versions(point.width, point.height).items():
+        if version != point.versions[name]:
+            raise GamesrError(f"{name} is {version} on this machine, but was {point.versions[name]} at planning: install the same one")
     with work, closing(low_frames(job)) as frames:
         return EncodedStream(frames, settings(point))
 

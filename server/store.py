@@ -21,9 +21,9 @@ APPLICATION_ID = 0x67616D65  # SQLite's field for "whose file is this": "game"
 LEASE_S = 30.0
 _BUSY_S = 60.0
 _SCHEMA = """
-CREATE TABLE points (key TEXT PRIMARY KEY, record TEXT NOT NULL) STRICT;
-CREATE TABLE latencies (key TEXT PRIMARY KEY, record TEXT NOT NULL) STRICT;
-CREATE TABLE claims (key TEXT PRIMARY KEY, owner TEXT NOT NULL, expires REAL NOT NULL) STRICT;
+CREATE TABLE points (key TEXT PRIMARY KEY, record TEXT NOT NULL);
+CREATE TABLE latencies (key TEXT PRIMARY KEY, record TEXT NOT NULL);
+CREATE TABLE claims (key TEXT PRIMARY KEY, owner TEXT NOT NULL, expires REAL NOT NULL);
 """
 _ALONE = "alone"
 

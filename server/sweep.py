@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ from server.workers import Workers
 _POLL_S = 0.5
 
 
-def run_sweep(plan: Plan, store: Store, workers: Workers) -> Iterator[Event]:
+def run_sweep(plan: Plan, store: Store, workers: Workers) -> Generator[Event]:
     """Measure what the store lacks of the plan: all points, then, when nothing else runs, all latencies.
 
     Closing the iterator stops the workers; what was finished is in the store. Raises OutputError where the store cannot be

@@ -58,7 +58,10 @@ class LocalWorkers:
                         else:
                             worker.end()
         finally:
-            for worker in (*at_work.values(), *idle):
+            left = (*at_work.values(), *idle)
+            for worker in left:
+                worker.stop()
+            for worker in left:
                 worker.end()
 
 
@@ -94,9 +97,12 @@ class _Worker:
             del self.missing[point.key]
             yield outcome
 
-    def end(self) -> None:
-        """Stop the process; it has a moment to stop its own VMAF and to remove its folder."""
+    def stop(self) -> None:
+        """Ask the process to end; it stops its own VMAF and removes that one's folder first."""
         self._process.terminate()
+
+    def end(self) -> None:
+        """See the process gone, whether it was asked or not."""
         self._process.join(_END_S)
         self._process.kill()
         self._process.join()

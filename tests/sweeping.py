@@ -58,11 +58,12 @@ def done(events: Sequence[Event]) -> SweepDone:
 
 
 def sweep_and_tell(plan: Plan, store: Path, tell: Connection) -> None:
-    """For a process of its own: a sweep with two workers that begins when it is told and sends every event."""
+    """For a process of its own: a sweep with two workers that sends every event, and goes on when it is told to."""
     tell.recv()
     with Store(store, lease_s=LEASE_S) as opened:
         for event in run_sweep(plan, opened, LocalWorkers(2)):
             tell.send(event)
+            tell.recv()
 
 
 def some_latency() -> LatencyResult:

@@ -205,6 +205,13 @@ def test_a_file_that_changes_after_planning_fails_its_points(
     assert done(sweep_here(plan, tmp_path / "other")).failed == 2
 
 
+def test_other_versions_than_those_planned_with_are_not_measured_with(clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = plan_of(clip, upscalers="bicubic", heights=[36], bitrates=[400])
+    monkeypatch.setattr("server.versions.av.__version__", "0")
+    (failed,) = (event for event in sweep_here(plan, tmp_path / "store") if isinstance(event, PointFailed))
+    assert failed.reason.startswith("av is 0 on this machine")
+
+
 def test_no_space_for_working_files_is_a_sentence_on_the_point(clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(**_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -281,13 +288,15 @@ def test_killed_in_mid_sweep_and_started_again_it_ends_as_if_nothing_had_been(cl
     plan = plan_of(clip, upscalers="none,bicubic,lanczos,gamesr", bitrates=[200, 400])
     whole = results(sweep_here(plan, tmp_path / "whole"))
     survived: dict[str, PointResult] = {}
-    for round_ in range(3):
+    for _ in range(3):
         process, events = start_sweep(plan, tmp_path / "store")
-        events.send("go")
-        for _ in range(3 + round_):
+        new = 0
+        while new < 2:
+            events.send("go on")
             event = events.recv()
             if isinstance(event, PointDone):
                 survived[event.result.point.key] = event.result
+                new += 1
         workers = children(process)
         process.kill()
         process.join()
@@ -310,14 +319,15 @@ def test_two_sweeps_on_one_store_share_the_work(clip: Path, tmp_path: Path) -> N
     started = [start_sweep(plan, tmp_path / "store") for _ in range(2)]
     seen: dict[Connection, list[Event]] = {connection: [] for _, connection in started}
     for connection in seen:
-        connection.send("go")
+        connection.send("go on")
     running = set(seen)
     while running:
         for connection in multiprocessing.connection.wait(list(running)):
             assert isinstance(connection, Connection)
             try:
                 seen[connection].append(connection.recv())
-            except EOFError:
+                connection.send("go on")
+            except (EOFError, BrokenPipeError):
                 running.remove(connection)
     for process, _ in started:
         process.join()

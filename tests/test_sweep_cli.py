@@ -94,7 +94,7 @@ def test_bad_input_is_one_sentence_before_any_work(
         ((clip, "--upscalers", "none,gamesr-openarena", "--heights", "24"), "gamesr-openarena needs a height that is a half of a clip's"),
         ((clip, "--upscalers", "bicubic", "--heights", "72"), "bicubic needs a height that is a half or a third"),
         ((clip, "--fps", "20"), "no whole part"),
-        ((clip, "--render", clip, wide), "which is no whole part"),
+        ((clip, "--render", clip, wide), "which is neither half nor a third"),
         ((clip, "--render", small, small), "is not one of the clips"),
         ((whole, "--render", whole, short), "has 5 frames"),
         ((clip, "--lpips", text), "not a readable ONNX model"),
@@ -129,7 +129,7 @@ def test_what_fails_is_said_at_the_end_and_the_rest_stays(
     arguments = (clip, *SMALL, "--upscalers", "none,bicubic", "--render", clip, short, "--store", tmp_path / "store")
     status, out, err = run(capsys, *arguments)
     assert status == 1 and "1 points measured, 0 reused, 1 failed" in out
-    assert "1 points and 1 latencies failed" in err and "not as many frames" in err and err.count("\n") == 1
+    assert "2 points or latencies could not be measured" in err and "not as many frames" in err and err.count("\n") == 1
 
 
 def test_names_stay_apart_where_two_clips_are_called_alike(make_clip: Callable[..., Path], tmp_path: Path) -> None:
