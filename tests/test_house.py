@@ -12,6 +12,7 @@ ROOT = Path(__file__).parent.parent
 RUNTIME = {"numpy", "av", "onnxruntime", "imageio_ffmpeg"}
 WORKSHOP = {"torch", "onnx", "tqdm"}
 HARNESS = {"distributed", "bjontegaard", "matplotlib"}
+SERVICE = {"fastapi", "starlette", "pydantic", "uvicorn", "prometheus_client", "anyio"}
 
 
 def imported(package: str) -> dict[str, set[str]]:
@@ -33,7 +34,7 @@ def imported(package: str) -> dict[str, set[str]]:
     [
         ("client", {"client"} | RUNTIME),
         ("model", {"client", "model"} | RUNTIME | WORKSHOP),
-        ("server", {"client", "server"} | RUNTIME | HARNESS),
+        ("server", {"client", "server"} | RUNTIME | HARNESS | SERVICE),
     ],
 )
 def test_imports_go_one_way(package: str, allowed: set[str]) -> None:
