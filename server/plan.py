@@ -11,8 +11,10 @@ import numpy as np
 from client.cloud import CloudSettings
 from client.errors import InputError
 from client.frames import Frame
+from server.asked import AskedSweep
 from server.clips import PARTS, SCALES, Clip, clip_names
 from server.job import Ask, Job
+from server.latency import latency_key
 from server.lpips import Lpips
 from server.points import Point
 from server.upscalers import Artifact, Upscalers
@@ -50,6 +52,12 @@ class Plan:
         points = [ask.point for job in self.jobs for ask in job.asks]
         clips, upscalers = (list(dict.fromkeys(names)) for names in ([p.clip for p in points], [p.upscaler for p in points]))
         return sorted(points, key=lambda p: (clips.index(p.clip), -p.low_height, upscalers.index(p.upscaler), p.requested_kbps))
+
+    @property
+    def asked(self) -> AskedSweep:
+        """What the store keeps of it."""
+        latencies = [latency_key(ask) for job in self.latency_jobs for ask in job.asks]
+        return AskedSweep.of(self.points, latencies)
 
 
 def make_plan(request: Request) -> Plan:

@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import Self
 
 from client.errors import OutputError
+from server.asked import AskedSweep
 from server.points import LatencyResult, PointResult
 
 SCHEMA_VERSION = 1
@@ -25,6 +26,8 @@ CREATE TABLE points (key TEXT PRIMARY KEY, record TEXT NOT NULL);
 CREATE TABLE latencies (key TEXT PRIMARY KEY, record TEXT NOT NULL);
 CREATE TABLE claims (key TEXT PRIMARY KEY, owner TEXT NOT NULL, expires REAL NOT NULL);
 """
+# Not in every store of this version: the first ones did not say which points were asked for together.
+_SWEEPS = "CREATE TABLE IF NOT EXISTS sweeps (key TEXT PRIMARY KEY, created_at REAL NOT NULL, record TEXT NOT NULL)"
 _ALONE = "alone"
 
 
@@ -79,6 +82,12 @@ class Store:
         """As `keep_point`, but the claim on the whole store stays."""
         self._keep("latencies", key, json.dumps(result.record()))
 
+    def keep_sweep(self, sweep: AskedSweep) -> None:
+        """Say that these points and latencies were asked for together; a sweep that is there already stays."""
+        with self._transaction() as connection:
+            row = (sweep.key, time.time(), json.dumps(sweep.record()))
+            connection.execute("INSERT OR IGNORE INTO sweeps VALUES (?, ?, ?)", row)
+
     def claim(self, keys: Iterable[str]) -> list[str]:
         """Those of the keys that are now this sweep's to compute: neither stored nor claimed by a sweep that is alive."""
         with self._transaction() as connection:
@@ -121,6 +130,7 @@ class Store:
                 self._connection.execute(statement)
             self._connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
             self._connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+        self._connection.execute(_SWEEPS)
         self._connection.execute("COMMIT")
 
     def _version(self) -> int | None:

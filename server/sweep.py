@@ -35,6 +35,7 @@ def run_sweep(plan: Plan, store: Store, workers: Workers) -> Generator[Event]:
     Closing the iterator stops the workers; what was finished is in the store. Raises OutputError where the store cannot be
     written; a point that cannot be measured is an event.
     """
+    store.keep_sweep(plan.asked)
     latencies = sum(len(job.asks) for job in plan.latency_jobs)
     yield PlanMade(len(plan.points), latencies, workers.count)
     points = _Points(plan, store, workers)
