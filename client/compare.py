@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import secrets
-from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import av
 import numpy as np
-from av.video.codeccontext import VideoCodecContext
 
 from client import lettering
 from client.errors import InputError, OutputError
 from client.frames import Frame, Plane
 from client.quality import squared_error
-from client.rgb import RgbPicture, to_rgb
+from client.rgb import RgbPicture, to_png, to_rgb
 from client.sink import MUXERS, FileSink
 from client.video import VideoSource
 
@@ -104,7 +101,7 @@ class _OnePicture:
             return
         partial = self._path.with_name(f".{self._path.name[:64]}.{secrets.token_hex(4)}.part")
         try:
-            partial.write_bytes(_png(_compose(*self._chosen, self._labels)))
+            partial.write_bytes(to_png(_compose(*self._chosen, self._labels)))
             partial.replace(self._path)
         except OSError as failure:
             raise OutputError(f"cannot write {self._path}: {failure.strerror}") from failure
@@ -213,11 +210,3 @@ def _area_of_greatest_difference(left: Plane, right: Plane) -> tuple[slice, slic
 
 def _copy(frame: Frame) -> Frame:
     return Frame(frame.y.copy(), frame.u.copy(), frame.v.copy(), frame.pts, frame.time_base, frame.colour)
-
-
-def _png(picture: RgbPicture) -> bytes:
-    encoder = VideoCodecContext.create("png", "w")
-    encoder.width, encoder.height, encoder.pix_fmt = picture.shape[1], picture.shape[0], "rgb24"
-    encoder.time_base = Fraction(1)
-    image = av.VideoFrame.from_ndarray(picture, format="rgb24")
-    return b"".join(bytes(packet) for packet in [*encoder.encode(image), *encoder.encode(None)])

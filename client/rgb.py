@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
+import av
 import numpy as np
+from av.video.codeccontext import VideoCodecContext
 from numpy.typing import NDArray
 
 from client.frames import ColourTags, Frame, Plane
@@ -28,6 +32,15 @@ def to_rgb(frame: Frame) -> RgbPicture:
     green = luma - 2 * (1 - kb) * kb / kg * cb - 2 * (1 - kr) * kr / kg * cr
     picture: RgbPicture = np.clip(np.rint(np.stack((red, green, blue), axis=-1)), 0, 255).astype(np.uint8)
     return picture
+
+
+def to_png(picture: RgbPicture) -> bytes:
+    """The picture as a PNG file."""
+    encoder = VideoCodecContext.create("png", "w")
+    encoder.width, encoder.height, encoder.pix_fmt = picture.shape[1], picture.shape[0], "rgb24"
+    encoder.time_base = Fraction(1)
+    image = av.VideoFrame.from_ndarray(picture, format="rgb24")
+    return b"".join(bytes(packet) for packet in [*encoder.encode(image), *encoder.encode(None)])
 
 
 def _scales(colour: ColourTags) -> tuple[float, float, int]:

@@ -34,3 +34,80 @@ describes all of it. What changes something takes the header X-API-Key where a k
 A picture is `reference`, `none` (native: the clip itself, encoded; `low_height` is then the clip's) or the name of a model. A clip
 of a sweep is found by `Sweep.clips[].source`, null where the service has not got the file. A frame is a number from 0.
 """
+
+from __future__ import annotations
+
+import logging
+from importlib.metadata import version
+from pathlib import Path
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import FileResponse, JSONResponse
+from starlette.exceptions import HTTPException
+from starlette.staticfiles import StaticFiles
+
+from client.errors import GamesrError
+from server.cards import artifacts
+from server.guards import Guards
+from server.monitoring import Watched
+from server.routes import clips, frames, health, models, players, results, sweeps
+from server.service import Service
+from server.settings import Settings
+
+PREFIX = "/api/v1"
+PAGE = Path(__file__).parent / "page"
+DESCRIPTION = "Rate-distortion curves of upscalers on game footage, what they save, what they cost, and sweeps that measure them."
+_LOG = logging.getLogger(__name__)
+
+
+def create_app(settings: Settings) -> FastAPI:
+    """The service for any ASGI server; raises OutputError for a store or a folder that cannot be used."""
+    service = Service(settings)
+    artifacts()  # read before the first request waits for it
+    # The pages that FastAPI has for its own description load scripts from elsewhere.
+    app = FastAPI(
+        title="gamesr-serve",
+        description=DESCRIPTION,
+        version=version("gamesr"),
+        openapi_url=f"{PREFIX}/openapi.json",
+        docs_url=None,
+        redoc_url=None,
+    )
+    app.state.service = service
+    app.add_middleware(Guards, limits=settings.limits, loopback=settings.loopback)
+    app.add_middleware(Watched, monitoring=service.monitoring)
+    app.add_exception_handler(HTTPException, _refused)
+    app.add_exception_handler(RequestValidationError, _unfit)
+    app.add_exception_handler(GamesrError, _unusable)
+    app.add_exception_handler(Exception, _broken)
+    app.include_router(health.router)
+    for subject in (sweeps, results, clips, frames, models, players):
+        app.include_router(subject.router, prefix=PREFIX)
+    app.add_api_route("/", _page, include_in_schema=False)
+    app.mount("/static", StaticFiles(directory=PAGE, check_dir=False))
+    return app
+
+
+def _page() -> FileResponse:
+    return FileResponse(PAGE / "index.html", headers={"Cache-Control": "no-cache"})
+
+
+async def _refused(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    return JSONResponse({"detail": str(error.detail)}, error.status_code, error.headers)
+
+
+async def _unfit(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    found = [f"{'.'.join(str(part) for part in one['loc'])}: {one['msg']}" for one in error.errors()[:5]]
+    return JSONResponse({"detail": "; ".join(found)}, 422)
+
+
+async def _unusable(request: Request, error: Exception) -> JSONResponse:
+    _LOG.error("%s", error)
+    return JSONResponse({"detail": "the store or the service's folder cannot be used: see the service's log"}, 503)
+
+
+async def _broken(request: Request, error: Exception) -> JSONResponse:
+    return JSONResponse({"detail": "an error of the service: see its log"}, 500)  # the server writes the trace there

@@ -26,7 +26,7 @@ class Request:
     """What the user asks for. `renders` are pairs of a clip and the same clip rendered small, which replaces its downscaling.
 
     `heights` and `fps` are None for the default: half and a third of every clip's height, and its own rate. `frames` is the
-    most frames of a clip, None for all.
+    most frames of a clip, None for all. `names` is what the clips are called, None for the names of their files.
     """
 
     clips: Sequence[Path]
@@ -37,6 +37,7 @@ class Request:
     fps: int | None = None
     frames: int | None = None
     lpips: Path | None = None
+    names: Sequence[str] | None = None
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,8 @@ def make_plan(request: Request) -> Plan:
     """
     clips = [Clip.read(path) for path in request.clips]
     names = clip_names(clips)
+    if request.names is not None:
+        names = dict(zip(request.clips, request.names, strict=True))
     renders = _renders(request, clips)
     upscalers = Upscalers(request.upscalers)
     lpips = {"lpips": _lpips_version(request.lpips, clips)} if request.lpips else {}

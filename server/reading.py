@@ -7,6 +7,7 @@ import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from urllib.parse import quote
 
@@ -39,10 +40,19 @@ class StoreReader:
     def sweeps(self) -> dict[str, KeptSweep]:
         """By key, the newest first."""
         with self._open() as connection:
-            if connection is None or not connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'sweeps'").fetchone():
+            if connection is None or not _has_sweeps(connection):
                 return {}
             rows = connection.execute("SELECT key, created_at, record FROM sweeps ORDER BY created_at DESC").fetchall()
-        return {key: KeptSweep(AskedSweep.from_record(json.loads(record)), created_at) for key, created_at, record in rows}
+        return {key: KeptSweep(_asked(record), created_at) for key, created_at, record in rows}
+
+    def sweep(self, beginning: str) -> tuple[str, KeptSweep] | None:
+        """The key and the sweep whose key begins so."""
+        with self._open() as connection:
+            if connection is None or not _has_sweeps(connection):
+                return None
+            query = "SELECT key, created_at, record FROM sweeps WHERE substr(key, 1, ?) = ?"
+            row = connection.execute(query, (len(beginning), beginning)).fetchone()
+        return None if row is None else (row[0], KeptSweep(_asked(row[2]), row[1]))
 
     def points(self, asked: AskedSweep) -> list[PointResult]:
         """Those of its points that are there, in its order and under its names."""
@@ -111,3 +121,13 @@ class StoreReader:
                 yield None if new else connection
         except sqlite3.Error as error:
             raise OutputError(f"the store {self.path} cannot be read: {error}") from error
+
+
+@lru_cache(maxsize=256)
+def _asked(record: str) -> AskedSweep:
+    return AskedSweep.from_record(json.loads(record))
+
+
+def _has_sweeps(connection: sqlite3.Connection) -> bool:
+    """A store whose sweeps were all made by an earlier version has no table of them."""
+    return connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'sweeps'").fetchone() is not None

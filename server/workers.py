@@ -5,14 +5,11 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
-import signal
-import sys
-import threading
 from collections.abc import Iterator
 from multiprocessing.connection import Connection, wait
-from types import FrameType
 from typing import Protocol
 
+from server.following import end_with_parent
 from server.job import Failed, Job, Outcome, run_job
 
 _BLAS_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -126,9 +123,7 @@ def _one_thread_each() -> Iterator[None]:
 
 
 def _work(connection: Connection) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it too, and ends this process
-    signal.signal(signal.SIGTERM, _leave)
-    threading.Thread(target=_follow_parent, daemon=True).start()
+    end_with_parent()  # nobody is left to take a result
     while True:
         try:
             job: Job = connection.recv()
@@ -136,14 +131,3 @@ def _work(connection: Connection) -> None:
             return
         for outcome in run_job(job):
             connection.send(outcome)
-
-
-def _leave(signum: int, frame: FrameType | None) -> None:
-    sys.exit(128 + signum)  # as an exception, so that VMAF's process and folder go first
-
-
-def _follow_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os.kill(os.getpid(), signal.SIGTERM)  # nobody is left to take a result

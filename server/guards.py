@@ -1,0 +1,129 @@
+"""What stands before every route: who may ask, how much may be sent and how slowly, and what a browser is told to beware of."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import hmac
+from typing import Annotated
+from urllib.parse import urlsplit
+
+from fastapi import HTTPException, Request, Security
+from fastapi.security import APIKeyHeader
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import JSONResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from server.settings import Limits
+
+KEY_HEADER = "X-API-Key"
+LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
+UPLOAD_PATH = "/api/v1/clips"
+_CHANGING = ("POST", "PUT", "PATCH", "DELETE")
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
+}
+_KEY = APIKeyHeader(name=KEY_HEADER, auto_error=False, description="for what changes something, where a key is configured")
+
+
+def require_key(request: Request, key: Annotated[str | None, Security(_KEY)]) -> None:
+    """Refuse what changes something without the configured key; digests are compared, in a time that tells nothing of it."""
+    wanted = request.app.state.service.settings.api_key
+    if wanted is not None and not same_key(key or "", wanted):
+        raise HTTPException(401, f"this needs the service's key in the header {KEY_HEADER}", {"WWW-Authenticate": KEY_HEADER})
+
+
+def same_key(given: str, wanted: str) -> bool:
+    """Compared in constant time, as digests, so that not even the length shows."""
+    digests = [hashlib.sha256(key.encode()).digest() for key in (given, wanted)]
+    return hmac.compare_digest(*digests)
+
+
+class Guards:
+    """The middleware around the whole service.
+
+    A browser that was led here from another site must not act for its user: a changing request of another origin is
+    refused, and, where only this machine is meant to ask, so is any name of the host but the machine's own (a site can
+    make its name point at this address). Bodies are bounded in bytes and in the time between two pieces.
+    """
+
+    def __init__(self, app: ASGIApp, *, limits: Limits, loopback: bool) -> None:
+        self._app, self._limits, self._loopback = app, limits, loopback
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        guarded = _with_headers(send)
+        refusal = self._refusal(scope["method"], headers)
+        if refusal is not None:
+            await JSONResponse({"detail": refusal}, 403)(scope, receive, guarded)
+            return
+        most = self._limits.upload_bytes if scope["path"] == UPLOAD_PATH else self._limits.body_bytes
+        length = headers.get("content-length", "0")
+        if length.isdigit() and int(length) > most:
+            await JSONResponse({"detail": _too_large(most)}, 413, {"Connection": "close"})(scope, receive, guarded)
+            return
+        await self._app(scope, _bounded(receive, most, self._limits.idle_s), guarded)
+
+    def _refusal(self, method: str, headers: Headers) -> str | None:
+        host = headers.get("host", "")
+        if self._loopback and _hostname(host) not in LOOPBACK_NAMES:
+            return "this service is for its own machine: use 127.0.0.1 or localhost"
+        origin, site = headers.get("origin"), headers.get("sec-fetch-site", "none")
+        if method in _CHANGING and (site not in ("none", "same-origin") or (origin is not None and urlsplit(origin).netloc != host)):
+            return "a page of another origin may not do this"
+        return None
+
+
+def _bounded(receive: Receive, most: int, idle_s: float) -> Receive:
+    received = 0
+
+    async def bounded() -> Message:
+        nonlocal received
+        if received < 0:  # the body is there: what comes next is that the caller leaves, whenever that is
+            return await receive()
+        try:
+            message = await asyncio.wait_for(receive(), idle_s)
+        except TimeoutError:
+            raise HTTPException(408, f"nothing came for {idle_s:g} s: send it again", {"Connection": "close"}) from None
+        if message["type"] == "http.request":
+            received += len(message.get("body", b""))
+            if received > most:
+                raise HTTPException(413, _too_large(most), {"Connection": "close"})
+            if not message.get("more_body", False):
+                received = -1
+        return message
+
+    return bounded
+
+
+def _with_headers(send: Send) -> Send:
+    async def guarded(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            headers = MutableHeaders(scope=message)
+            for name, value in _HEADERS.items():
+                headers[name] = value
+            headers.setdefault("Cache-Control", "no-store")
+        await send(message)
+
+    return guarded
+
+
+def _too_large(most: int) -> str:
+    return f"more than {most} bytes are not taken here"
+
+
+def _hostname(host: str) -> str:
+    try:
+        return urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        return ""

@@ -1,0 +1,152 @@
+"""Clips by name: those of the folder that the service was given, and those that were uploaded."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import secrets
+import threading
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+from client.errors import InputError, OutputError
+from server.clips import SCALES
+from server.database import Database
+from server.probe import Known, probe
+from server.requests import NAME, StoredClip
+from server.settings import Settings
+
+UPLOADED = "upload-"
+_LOOKED_AT = threading.Lock()  # one process looks at a clip at a time
+
+
+class Library:
+    """A clip's name is looked up among the files that are there; no path is ever made of what a caller sent.
+
+    Files of the folder whose names are no names, links, and what lies in folders below it are not seen. What is found out
+    about a file is remembered for as long as its size and time stay the same.
+    """
+
+    def __init__(self, database: Database, settings: Settings) -> None:
+        self._database, self._settings = database, settings
+
+    def clips(self) -> tuple[list[StoredClip], dict[str, str]]:
+        """Every clip, and the files of the folder that cannot be used with the reason why."""
+        found, refused = [], {}
+        for name in sorted(self._files()):
+            try:
+                clip = self.clip(name)
+            except InputError as error:
+                refused[name] = str(error)
+            else:
+                found += [clip] if clip else []
+        return found, refused
+
+    def clip(self, name: str) -> StoredClip | None:
+        """None where there is no such clip; raises InputError for a file of the folder that cannot be used."""
+        path = self.path(name)
+        if path is None:
+            return None
+        try:
+            status = path.stat()
+        except OSError:
+            return None
+        stamp = f"{status.st_size} {status.st_mtime_ns}"
+        row = self._row(name, stamp)
+        if row is None:
+            with _LOOKED_AT:
+                row = self._row(name, stamp) or self._look_at(name, path, stamp)
+        title, known, refused = row
+        if known is None:
+            raise InputError(str(refused))
+        return _stored(name, title, status.st_size, Known(**json.loads(known)))
+
+    def path(self, name: str) -> Path | None:
+        return self._files().get(name)
+
+    def known_names(self) -> dict[str, str]:
+        """By sha256, the clips that have been looked at before."""
+        there = self._files()
+        rows = self._database.rows("SELECT name, known FROM clips WHERE known IS NOT NULL")
+        return {str(json.loads(known)["sha256"]): str(name) for name, known in rows if name in there}
+
+    def uploads(self) -> int:
+        return sum(name.startswith(UPLOADED) for name in self._files())
+
+    def take_in(self, uploaded: Path, suffix: str, title: str | None) -> StoredClip:
+        """Look at an uploaded file and keep it under a name of ours; raises InputError for what is no usable clip.
+
+        The same clip a second time is the first one again. The file is moved or left to the caller to remove.
+        """
+        with _LOOKED_AT:
+            known = probe(uploaded, self._settings.limits, whole=True)
+        name = self.known_names().get(known.sha256)
+        if name is None or not name.startswith(UPLOADED):
+            name = f"{UPLOADED}{secrets.token_hex(8)}{suffix}"
+            path = self._settings.uploads / name
+            uploaded.rename(path)
+            status = path.stat()
+            self._remember(name, f"{status.st_size} {status.st_mtime_ns}", title or name, known, None)
+        clip = self.clip(name)
+        if clip is None:
+            raise OutputError(f"{name} went away while it was kept")
+        return clip
+
+    def remove(self, name: str) -> None:
+        """Forget an upload and delete its file."""
+        path = self.path(name)
+        if path is not None and name.startswith(UPLOADED):
+            path.unlink(missing_ok=True)
+            with self._database.transaction() as connection:
+                connection.execute("DELETE FROM clips WHERE name = ?", (name,))
+
+    def _files(self) -> dict[str, Path]:
+        files = {path.name: path for path in _usable(self._settings.clips) if not path.name.startswith(UPLOADED)}
+        return files | {path.name: path for path in _usable(self._settings.uploads) if path.name.startswith(UPLOADED)}
+
+    def _row(self, name: str, stamp: str) -> tuple[str, str | None, str | None] | None:
+        rows = self._database.rows("SELECT title, known, refused FROM clips WHERE name = ? AND stamp = ?", name, stamp)
+        return (rows[0][0], rows[0][1], rows[0][2]) if rows else None
+
+    def _look_at(self, name: str, path: Path, stamp: str) -> tuple[str, str | None, str | None]:
+        """Not whole: the folder's clips are the operator's own, and may be long."""
+        try:
+            known = probe(path, self._settings.limits, whole=False)
+        except InputError as error:
+            return self._remember(name, stamp, name, None, str(error))
+        return self._remember(name, stamp, name, known, None)
+
+    def _remember(self, name: str, stamp: str, title: str, known: Known | None, refused: str | None) -> tuple[str, str | None, str | None]:
+        row = title, None if known is None else json.dumps(asdict(known)), refused
+        with self._database.transaction() as connection:
+            connection.execute(
+                "INSERT OR REPLACE INTO clips (name, stamp, title, known, refused) VALUES (?, ?, ?, ?, ?)", (name, stamp, *row)
+            )
+        return row
+
+
+def low_heights(width: int, height: int) -> list[int]:
+    """The whole, half and third of a height that 4:2:0 can hold at that scale."""
+    return [height // scale for scale in (1, *SCALES) if width % (2 * scale) == 0 and height % (2 * scale) == 0]
+
+
+def _usable(folder: Path | None) -> Iterator[Path]:
+    if folder is not None:
+        with contextlib.suppress(OSError):
+            for path in folder.iterdir():
+                if re.fullmatch(NAME, path.name) and path.is_file() and not path.is_symlink():
+                    yield path
+
+
+def _stored(name: str, title: str, size_bytes: int, known: Known) -> StoredClip:
+    return StoredClip(
+        name=name,
+        origin="upload" if name.startswith(UPLOADED) else "folder",
+        title=title,
+        size_bytes=size_bytes,
+        duration_s=known.frames / known.fps,
+        low_heights=low_heights(known.width, known.height),
+        **asdict(known),
+    )

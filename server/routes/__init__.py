@@ -1,0 +1,1 @@
+"""What the service answers to, a file a subject; `server.app` has the list."""

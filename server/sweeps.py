@@ -1,0 +1,143 @@
+"""Every sweep that there is, whoever started it: those of the queue, and those that gamesr-sweep measured into the same store."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from threading import Lock
+from typing import Any
+
+from pydantic import BaseModel
+
+from server.asked import AskedSweep
+from server.library import Library
+from server.points import LatencyResult, PointResult
+from server.queue import QueuedSweep, SweepQueue, fresh_progress
+from server.reading import KeptSweep, StoreReader
+from server.schemas import ClipOfSweep, Progress, Sweep
+
+_ID_DIGITS = 16
+_KEPT_ANSWERS = 256
+_NOTHING = AskedSweep((), (), (), (), (), ())
+
+
+class Sweeps:
+    """Sweeps by their id: a random one in the queue, the beginning of its key in the store."""
+
+    def __init__(self, reader: StoreReader, queue: SweepQueue, library: Library) -> None:
+        self._reader, self._queue, self._library = reader, queue, library
+        self._answers: OrderedDict[tuple[Any, ...], bytes] = OrderedDict()
+        self._lock = Lock()
+
+    def all(self) -> list[Sweep]:
+        """The newest first; one that was started over HTTP is not there a second time as a sweep of the store."""
+        kept, queued, sources = self._reader.sweeps(), self._queue.all(), self._library.known_names()
+        mine = {sweep.plan_key for sweep in queued}
+        found = [_of_queue(sweep, kept.get(sweep.plan_key or ""), sources) for sweep in queued]
+        found += [self._of_store(key, sweep, sources) for key, sweep in kept.items() if key not in mine]
+        return sorted(found, key=lambda sweep: sweep.created_at, reverse=True)
+
+    def find(self, sweep: str) -> Sweep | None:
+        sources = self._library.known_names()
+        queued = self._queue.find(sweep)
+        if queued is not None:
+            return _of_queue(queued, self._kept(queued), sources)
+        found = self._reader.sweep(sweep)
+        return None if found is None else self._of_store(*found, sources)
+
+    def progress(self, sweep: str) -> Progress | None:
+        queued = self._queue.find(sweep)
+        if queued is not None:
+            return queued.progress
+        found = self._reader.sweep(sweep)
+        return None if found is None else self._progress(found[1].asked)
+
+    def answer(
+        self, sweep: str, build: Callable[[Sequence[PointResult], Sequence[LatencyResult]], BaseModel], *about: object
+    ) -> bytes | None:
+        """What `build` makes of a sweep's results, as JSON; None where there is no such sweep.
+
+        Results only ever come, so an answer holds for as long as their number stays; `about` tells what is asked.
+        """
+        asked = self._asked(sweep)
+        if asked is None:
+            return None
+        key = (sweep, about, *self._reader.counts(asked))
+        with self._lock:
+            if key in self._answers:
+                self._answers.move_to_end(key)
+                return self._answers[key]
+        content = build(self._reader.points(asked), self._reader.latencies(asked)).model_dump_json().encode()
+        with self._lock:
+            self._answers[key] = content
+            while len(self._answers) > _KEPT_ANSWERS:
+                self._answers.popitem(last=False)
+        return content
+
+    def _asked(self, sweep: str) -> AskedSweep | None:
+        """Which results are this sweep's; none of them before it is planned."""
+        queued = self._queue.find(sweep)
+        if queued is not None:
+            kept = self._kept(queued)
+            return kept.asked if kept else _NOTHING
+        found = self._reader.sweep(sweep)
+        return found[1].asked if found else None
+
+    def _kept(self, queued: QueuedSweep) -> KeptSweep | None:
+        found = self._reader.sweep(queued.plan_key) if queued.plan_key else None
+        return found[1] if found else None
+
+    def _of_store(self, key: str, kept: KeptSweep, sources: dict[str, str]) -> Sweep:
+        return Sweep(
+            id=key[:_ID_DIGITS],
+            origin="command",
+            created_at=kept.created_at,
+            clips=_clips(kept.asked, sources),
+            upscalers=list(kept.asked.upscalers),
+            low_heights=list(kept.asked.low_heights),
+            bitrates_kbps=list(kept.asked.bitrates_kbps),
+            progress=self._progress(kept.asked),
+            failures=[],
+        )
+
+    def _progress(self, asked: AskedSweep) -> Progress:
+        """As far as the store shows; what failed is known to the command only."""
+        points, latencies = self._reader.counts(asked)
+        totals = len({point.key for point in asked.points}), len(set(asked.latencies))
+        change = {
+            "points_total": totals[0],
+            "points_done": points,
+            "latencies_total": totals[1],
+            "latencies_done": latencies,
+        }
+        return fresh_progress("done" if (points, latencies) == totals else "partial").model_copy(update=change)
+
+
+def _of_queue(queued: QueuedSweep, kept: KeptSweep | None, sources: dict[str, str]) -> Sweep:
+    request = queued.request
+    return Sweep(
+        id=queued.id,
+        origin="service",
+        created_at=queued.created_at,
+        clips=_clips(kept.asked, sources) if kept else [],
+        upscalers=list(request.upscalers),
+        low_heights=list(kept.asked.low_heights) if kept else [],
+        bitrates_kbps=sorted(request.bitrates_kbps),
+        progress=queued.progress,
+        failures=list(queued.failures),
+    )
+
+
+def _clips(asked: AskedSweep, sources: dict[str, str]) -> list[ClipOfSweep]:
+    return [
+        ClipOfSweep(
+            clip=clip.name,
+            sha256=clip.sha256,
+            width=clip.width,
+            height=clip.height,
+            fps=clip.fps,
+            frames=clip.frames,
+            source=sources.get(clip.sha256),
+        )
+        for clip in asked.clips
+    ]
