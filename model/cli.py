@@ -25,7 +25,7 @@ from model.train import TrainConfig, Trainer, load_checkpoint, network_of
 from model.verify import crop, parity, parse_size
 
 TRAIN_EXAMPLES = """\
-The footage list is a TOML file of scenes (see model/footage.py); scenes are split by map or track. A run lives in one
+The footage list is a TOML file of scenes (gamesr-footage makes one); scenes are split by map or track. A run lives in one
 folder and goes on where it stopped when the same command is given again:
 
   gamesr-train footage.toml runs/openarena_x2 --games openarena --steps 20000
@@ -51,7 +51,8 @@ def train_main(argv: Sequence[str] | None = None) -> int:
         nargs="+",
         default=defaults["degradations"],
         metavar="HOW",
-        help="area, native, area@4000 (x264 at 4000 kbps)...; twice is twice as often (default: %(default)s)",
+        help="area, native, native:aa (against the anti-aliased reference), area@4000 (x264 at 4000 kbps)...; twice is twice as often "
+        "(default: %(default)s)",
     )
     for name, text in (
         ("steps", "optimizer updates"),

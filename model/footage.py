@@ -9,6 +9,9 @@ A footage list is a TOML file; paths are relative to it:
     fps = 60
     reference = "oa_koth1_1080p.mkv"        # the high-resolution picture
     native = { 540 = "oa_koth1_540p.mkv" }  # optional: the same frames rendered at lower heights
+    antialiased = "oa_koth1_1080p_aa.mkv"   # optional: the reference's frames, supersampled
+
+gamesr-footage makes such a list, and the footage.
 """
 
 from __future__ import annotations
@@ -44,6 +47,7 @@ class Scene:
     fps: int
     reference: Path
     native: dict[int, Path] = field(default_factory=dict)
+    antialiased: Path | None = None
 
     @property
     def title(self) -> str:
@@ -59,6 +63,7 @@ def load_scenes(footage: Path, *, split: str, games: Iterable[str] = ()) -> list
                 **{key: row[key] for key in ("name", "game", "split", "fps")},
                 reference=footage.parent / row["reference"],
                 native={int(height): footage.parent / path for height, path in row.get("native", {}).items()},
+                antialiased=footage.parent / row["antialiased"] if "antialiased" in row else None,
             )
             for row in rows
         ]
@@ -77,20 +82,30 @@ def load_scenes(footage: Path, *, split: str, games: Iterable[str] = ()) -> list
 
 @dataclass(frozen=True)
 class Degradation:
-    """How the low-resolution picture comes about; written `area`, `native`, `area@4000` (encoded at 4000 kbps) and so on."""
+    """How the low-resolution picture comes about, and what it is to become again.
+
+    Written `area` (averaged down), `native` (rendered small: aliased), `native:aa` (the same, held against the anti-aliased
+    reference), each also encoded: `area@4000` at 4000 kbps.
+    """
 
     source: str
     bitrate_kbps: int | None = None
+    antialiased: bool = False
 
     @classmethod
     def parse(cls, text: str) -> Degradation:
-        source, at, bitrate = text.partition("@")
-        if source not in ("area", "native") or (at and not (bitrate.isdigit() and int(bitrate))):
-            raise InputError(f"{text!r} is not a degradation: write area, native, area@4000 or native@4000 (kbps)")
-        return cls(source, int(bitrate) if bitrate else None)
+        how, at, bitrate = text.partition("@")
+        source, colon, target = how.partition(":")
+        if source not in ("area", "native") or (colon and target != "aa") or (at and not (bitrate.isdigit() and int(bitrate))):
+            raise InputError(f"{text!r} is not a degradation: write area, native, area:aa or native:aa, and @4000 behind it for 4000 kbps")
+        return cls(source, int(bitrate) if bitrate else None, bool(colon))
 
     def __str__(self) -> str:
-        return self.source + (f"@{self.bitrate_kbps}" if self.bitrate_kbps else "")
+        return self.source + (":aa" if self.antialiased else "") + (f"@{self.bitrate_kbps}" if self.bitrate_kbps else "")
+
+    def fits(self, scene: Scene) -> bool:
+        """Has the scene been rendered in the ways that this needs, at some height?"""
+        return (self.source != "native" or bool(scene.native)) and (not self.antialiased or scene.antialiased is not None)
 
 
 @dataclass(frozen=True)
@@ -128,13 +143,16 @@ class FootageCache:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
 
-    def reference(self, scene: Scene) -> Take:
-        return self._take({"file": _digest(scene.reference)}, lambda: read_frames(scene.reference))
+    def reference(self, scene: Scene, *, antialiased: bool = False) -> Take:
+        """The scene as it should become; raises InputError when an anti-aliased one is wanted and there is none."""
+        path = _target(scene, antialiased)
+        return self._take({"file": _digest(path)}, lambda: read_frames(path))
 
     def degraded(self, scene: Scene, scale: int, degradation: Degradation) -> Take:
         """The scene at 1/scale; raises InputError when a native render is wanted and there is none of that size."""
-        reference = self.reference(scene)
-        key: dict[str, object] = {"file": _digest(scene.reference), "scale": scale, "source": degradation.source}
+        reference = self.reference(scene, antialiased=degradation.antialiased)
+        digest = _digest(_target(scene, degradation.antialiased))
+        key: dict[str, object] = {"file": digest, "scale": scale, "source": degradation.source}
         if degradation.source == "native":
             height = reference.height // scale
             if height not in scene.native:
@@ -167,6 +185,13 @@ class FootageCache:
         return Take(np.load(path, mmap_mode="c"))  # torch warns of arrays that it could not write to
 
 
+def _target(scene: Scene, antialiased: bool) -> Path:
+    path = scene.antialiased if antialiased else scene.reference
+    if path is None:
+        raise InputError(f"{scene.title} has no anti-aliased reference")
+    return path
+
+
 def _digest(path: Path) -> str:
     try:
         with path.open("rb") as file:
@@ -188,11 +213,14 @@ class Pair:
 
 
 def load_pairs(scenes: Iterable[Scene], cache: FootageCache, scale: int, degradations: Iterable[Degradation]) -> list[list[Pair]]:
-    """For each scene its degraded takes; one missing native render of a scene leaves that one out."""
+    """For each scene its degraded takes, those left out for which it was not rendered."""
+    wanted = list(degradations)
     pairs = []
     for scene in scenes:
-        takes = [d for d in degradations if d.source != "native" or scene.native]
-        pairs.append([Pair(f"{scene.title} {d}", cache.degraded(scene, scale, d), cache.reference(scene)) for d in takes])
+        takes = [d for d in wanted if d.fits(scene)]
+        pairs.append(
+            [Pair(f"{scene.title} {d}", cache.degraded(scene, scale, d), cache.reference(scene, antialiased=d.antialiased)) for d in takes]
+        )
     return [takes for takes in pairs if takes]
 
 

@@ -1,0 +1,1 @@
+"""Filming free games: the training and test footage, rendered again by anyone."""
