@@ -19,13 +19,14 @@ from server.requests import NAME, StoredClip
 from server.settings import Settings
 
 UPLOADED = "upload-"
+SUFFIXES = (".mp4", ".mkv", ".mov", ".webm", ".ts", ".avi", ".h264", ".ivf", ".y4m")  # of a folder's clips
 _LOOKED_AT = threading.Lock()  # one process looks at a clip at a time
 
 
 class Library:
     """A clip's name is looked up among the files that are there; no path is ever made of what a caller sent.
 
-    Files of the folder whose names are no names, links, and what lies in folders below it are not seen. What is found out
+    Of the folder, files of other suffixes, names that are no names, links, and what lies in folders below it are not seen. What is found out
     about a file is remembered for as long as its size and time stay the same.
     """
 
@@ -103,7 +104,8 @@ class Library:
                 connection.execute("DELETE FROM clips WHERE name = ?", (name,))
 
     def _files(self) -> dict[str, Path]:
-        files = {path.name: path for path in _usable(self._settings.clips) if not path.name.startswith(UPLOADED)}
+        in_folder = [path for path in _usable(self._settings.clips) if path.suffix.lower() in SUFFIXES]
+        files = {path.name: path for path in in_folder if not path.name.startswith(UPLOADED)}
         return files | {path.name: path for path in _usable(self._settings.uploads) if path.name.startswith(UPLOADED)}
 
     def _row(self, name: str, stamp: str) -> tuple[str, str | None, str | None] | None:
