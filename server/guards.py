@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
 import hmac
 from typing import Annotated
@@ -30,6 +31,8 @@ _HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
 }
+_DRAIN_BYTES = 8 * 2**20
+_DRAIN_S = 2.0
 _KEY = APIKeyHeader(name=KEY_HEADER, auto_error=False, description="for what changes something, where a key is configured")
 
 
@@ -70,6 +73,7 @@ class Guards:
         most = self._limits.upload_bytes if scope["path"] == UPLOAD_PATH else self._limits.body_bytes
         length = headers.get("content-length", "0")
         if length.isdigit() and int(length) > most:
+            await _drain(receive)
             await JSONResponse({"detail": _too_large(most)}, 413, {"Connection": "close"})(scope, receive, guarded)
             return
         await self._app(scope, _bounded(receive, most, self._limits.idle_s), guarded)
@@ -98,12 +102,26 @@ def _bounded(receive: Receive, most: int, idle_s: float) -> Receive:
         if message["type"] == "http.request":
             received += len(message.get("body", b""))
             if received > most:
+                if message.get("more_body", False):
+                    await _drain(receive)
                 raise HTTPException(413, _too_large(most), {"Connection": "close"})
             if not message.get("more_body", False):
                 received = -1
         return message
 
     return bounded
+
+
+async def _drain(receive: Receive) -> None:
+    """Let the rest of a body go by, within bounds: where a connection is closed with bytes unread, the answer can be lost."""
+    drained = 0
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(_DRAIN_S):
+            while drained < _DRAIN_BYTES:
+                message = await receive()
+                drained += len(message.get("body", b""))
+                if not message.get("more_body", False):
+                    return
 
 
 def _with_headers(send: Send) -> Send:

@@ -26,8 +26,8 @@ _LOOKED_AT = threading.Lock()  # one process looks at a clip at a time
 class Library:
     """A clip's name is looked up among the files that are there; no path is ever made of what a caller sent.
 
-    Of the folder, files of other suffixes, names that are no names, links, and what lies in folders below it are not seen. What is found out
-    about a file is remembered for as long as its size and time stay the same.
+    Of the folder, files of other suffixes, names that are no names, links, and what lies in folders below it are not seen. What is
+    found out about a file is remembered for as long as its size and time stay the same.
     """
 
     def __init__(self, database: Database, settings: Settings) -> None:

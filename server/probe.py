@@ -124,7 +124,7 @@ def _decoded(source: object, most: int, task: _Task) -> int:
         if source.decode_errors or decoded.frame.damaged:
             break
     if source.decode_errors or (frames and decoded.frame.damaged):
-        raise InputError("the clip is damaged: nothing can be measured against it")
+        raise InputError("the clip is damaged, or needs more memory to decode than it may have: nothing can be measured against it")
     if not frames:
         raise InputError("no frame of the clip can be decoded")
     return frames

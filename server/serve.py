@@ -100,12 +100,12 @@ def serve(arguments: argparse.Namespace) -> None:
     except ModuleNotFoundError as error:
         raise OutputError(f"the service needs {error.name}: pip install 'gamesr[serve]'") from error
     app = create_app(settings)
-    # No proxy's word is taken for where a request comes from, and open event streams do not hold up the end.
-    config = uvicorn.Config(app, log_level="warning", server_header=False, proxy_headers=False, timeout_graceful_shutdown=2)
     with _bind(arguments.host, arguments.port) as listener:
         host, port = listener.getsockname()[:2]
         with nullcontext() if arguments.no_runner else RunnerProcess(replace(settings, api_key=None)):
             print(f"{PROGRAM}: http://{f'[{host}]' if ':' in host else host}:{port}/", flush=True)
+            # No proxy's word is taken for where a request comes from, and open event streams do not hold up the end.
+            config = uvicorn.Config(app, log_level="warning", server_header=False, proxy_headers=False, timeout_graceful_shutdown=2)
             uvicorn.Server(config).run([listener])
 
 

@@ -1,0 +1,269 @@
+"""What the service answers: the store's results, the figures that the same functions give by hand, and no more than it should."""
+
+from __future__ import annotations
+
+import hmac
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from client.models import shipped_models
+from server import guards
+from server.asked import AskedSweep
+from server.bdrate import Figure, Undefined, bitrate_at, saving
+from server.curves import METRICS, anchors, compare, series_by_clip
+from server.points import LatencyResult, PointResult
+from server.reading import StoreReader
+from server.store import Store
+from tests.measured import latency_results, sweep_results
+from tests.serving import KEY, serving, settings
+
+PLAYED: dict[str, Any] = {
+    "model": "gamesr",
+    "model_sha256": "0" * 64,
+    "provider": "cpu",
+    "threads": 2,
+    "machine": "a player's",
+    "low_width": 960,
+    "low_height": 540,
+    "scale": 2,
+    "latency_us": {"total": {"count": 50, "p50": 9000.0, "p95": 12000, "p99": 20000, "max": 30000}},
+    "deadline_misses": {"30": 0, "60": 2, "120": 40},
+}
+
+
+def filled(store: Path, results: Sequence[PointResult], latencies: Sequence[LatencyResult]) -> str:
+    """A store with a sweep of these; returns its id."""
+    with Store(store) as opened:
+        asked = AskedSweep.of([result.point for result in results], [f"latency {n}" for n in range(len(latencies))])
+        opened.keep_sweep(asked)
+        for result in results:
+            opened.keep_point(result)
+        for key, latency in zip(asked.latencies, latencies, strict=True):
+            opened.keep_latency(key, latency)
+    return asked.key[:16]
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[httpx.Client, str]]:
+    """A service over a sweep of two clips, and the sweep's id."""
+    folder = tmp_path_factory.mktemp("serve")
+    of = settings(folder)
+    sweep = filled(of.store, sweep_results(), latency_results())
+    with serving(of) as client:
+        yield client, f"/api/v1/sweeps/{sweep}"
+
+
+def read(client: httpx.Client, path: str, **query: Any) -> Any:
+    answer = client.get(path, params=query)
+    assert answer.status_code == 200, answer.text
+    return answer.json()
+
+
+def figure(number: Figure | None) -> dict[str, Any] | None:
+    if number is None:
+        return None
+    return {"value": None, "undefined": number.reason} if isinstance(number, Undefined) else {"value": number, "undefined": None}
+
+
+def test_a_sweep_of_the_command_is_listed_with_what_was_asked(measured: tuple[httpx.Client, str]) -> None:
+    client, path = measured
+    (sweep,) = read(client, "/api/v1/sweeps")["sweeps"]
+    assert sweep == read(client, path) and path.endswith(sweep["id"])
+    assert (sweep["origin"], sweep["progress"]["state"]) == ("command", "done")
+    assert [clip["clip"] for clip in sweep["clips"]] == ["map", "track"] and sweep["clips"][0]["source"] is None
+    assert sweep["upscalers"] == ["none", "bicubic", "lanczos", "easu", "fsr1", "gamesr"] and sweep["low_heights"] == [1080, 540, 360]
+    assert sweep["progress"]["points_done"] == sweep["progress"]["points_total"] == len(sweep_results())
+
+
+def test_points_and_curves_are_those_of_the_store(measured: tuple[httpx.Client, str]) -> None:
+    client, path = measured
+    results = sweep_results()
+    points = read(client, f"{path}/points")["points"]
+    assert [point["key"] for point in points] == [result.point.key for result in results]
+    assert points[0]["quality"] == results[0].quality.record() and points[0]["label"] == "native"
+    assert len(read(client, f"{path}/points", clip="map")["points"]) == len(results) / 2
+    for metric, title in METRICS.items():
+        curves = read(client, f"{path}/curves", metric=metric)
+        assert curves["metric_label"] == title and bool(curves["grades"]) == metric.startswith("vmaf")
+        for clip, of_clip in zip(curves["clips"], series_by_clip(results).values(), strict=True):
+            for curve, series in zip(clip["curves"], of_clip, strict=True):
+                assert (curve["upscaler"], curve["low_height"], curve["undefined"]) == (series.upscaler, series.low_height, None)
+                assert [point["quality"] for point in curve["points"]] == [getattr(r.quality, metric) for r in series.results]
+                assert [point["bitrate_kbps"] for point in curve["points"]] == [r.bitrate_kbps for r in series.results]
+
+
+def test_bd_rates_and_savings_are_what_the_same_functions_give(measured: tuple[httpx.Client, str]) -> None:
+    client, path = measured
+    by_clip = series_by_clip(sweep_results())
+    compared = [(clip, compare(s, anchor)) for clip, of_clip in by_clip.items() for s in of_clip for anchor in anchors(s, of_clip)]
+    for record, (clip, comparison) in zip(read(client, f"{path}/bd-rates")["bd_rates"], compared, strict=True):
+        assert (record["clip"], record["series"]["upscaler"]) == (clip, comparison.series.upscaler)
+        assert record["anchor"]["low_height"] == comparison.anchor.low_height
+        assert record["bd_rate_percent"] == {metric: figure(value) for metric, value in comparison.bd_rate_percent.items()}
+        assert record["bd_quality"] == {metric: figure(value) for metric, value in comparison.bd_quality.items()}
+    for target, metric in ((71.5, "vmaf"), (80, "vmaf_neg"), (99.9, "vmaf"), (0, "vmaf")):
+        records = iter(read(client, f"{path}/savings", target=target, metric=metric)["savings"])
+        for of_clip in by_clip.values():
+            for series in of_clip:
+                record = next(records)
+                curve = series.curve(metric)
+                over = {anchor.upscaler: saving(anchor.curve(metric), curve, target) for anchor in anchors(series, of_clip)}
+                assert record["bitrate_kbps"] == figure(bitrate_at(curve, target))
+                assert record["over_native_percent"] == figure(over.get("none"))
+                assert record["over_bicubic_percent"] == figure(over.get("bicubic"))
+    beyond = read(client, f"{path}/savings", target=99.9)["savings"][0]["bitrate_kbps"]
+    assert beyond["value"] is None and "never reaches VMAF 99.9" in beyond["undefined"]
+
+
+def test_latencies_have_percentiles_by_stage_and_the_share_of_missed_deadlines(measured: tuple[httpx.Client, str]) -> None:
+    client, path = measured
+    latencies = read(client, f"{path}/latencies")["latencies"]
+    for record, result in zip(latencies, latency_results(), strict=True):
+        assert record["latency_us"] == {stage: summary.record() for stage, summary in result.latency_us.items()}
+        shares = {deadline["fps"]: deadline["missed_share"] for deadline in record["deadlines"]}
+        assert shares == {fps: missed / result.frames for fps, missed in result.deadline_misses.items()}
+    assert latencies[0]["deadlines"][1]["deadline_us"] == pytest.approx(16666.67, abs=0.01)
+    every = read(client, "/api/v1/latencies", upscaler="gamesr")["latencies"]
+    assert {latency["upscaler"] for latency in every} == {"gamesr"} and len(every) == 4
+
+
+def test_a_figure_that_is_missing_is_null_with_its_reason(tmp_path: Path) -> None:
+    of = settings(tmp_path)
+    results = sweep_results(("map",), (540,))
+    quality = replace(results[0].quality, vmaf=None, undefined={"vmaf": "no ffmpeg"})
+    sweep = filled(of.store, [replace(results[0], quality=quality), *results[1:]], [])
+    with serving(of) as client:
+        path = f"/api/v1/sweeps/{sweep}"
+        assert read(client, f"{path}/points")["points"][0]["quality"]["undefined"] == {"vmaf": "no ffmpeg"}
+        curve = read(client, f"{path}/curves")["clips"][0]["curves"][0]
+        assert "no ffmpeg" in curve["undefined"] and curve["points"][0]["quality"] is None
+        rates = read(client, f"{path}/bd-rates")["bd_rates"]
+        assert all(
+            "native 1080p has no VMAF" in r["bd_rate_percent"]["vmaf"]["undefined"] for r in rates if r["anchor"]["upscaler"] == "none"
+        )
+
+
+def test_an_answer_grows_with_the_store(tmp_path: Path) -> None:
+    of = settings(tmp_path)
+    results = sweep_results(("map",), (540,))
+    with Store(of.store) as store, serving(of) as client:
+        asked = AskedSweep.of([result.point for result in results], [])
+        store.keep_sweep(asked)
+        path = f"/api/v1/sweeps/{asked.key[:16]}"
+        for count, result in enumerate(results[:3]):
+            assert len(read(client, f"{path}/points")["points"]) == count
+            assert read(client, path)["progress"]["points_done"] == count and read(client, path)["progress"]["state"] == "partial"
+            store.keep_point(result)
+
+
+def test_points_have_the_names_of_the_sweep_that_asks(tmp_path: Path) -> None:
+    first, _ = results = sweep_results(("map",), (540,))[:2]
+    filled(tmp_path / "store", results, [])
+    renamed = [replace(result.point, clip="another name") for result in results]
+    with Store(tmp_path / "store") as store:
+        store.keep_sweep(AskedSweep.of([*renamed, replace(first.point, fps=30)], []))
+    newest, _ = StoreReader(tmp_path / "store").sweeps().values()
+    assert {result.point.clip for result in StoreReader(tmp_path / "store").points(newest.asked)} == {"another name"}
+
+
+def test_models_come_with_their_cards(measured: tuple[httpx.Client, str]) -> None:
+    client, _ = measured
+    models = read(client, "/api/v1/models")["models"]
+    assert [f"{model['name']}_x{model['scale']}" for model in models] == [path.stem for path in shipped_models()]
+    gamesr = read(client, "/api/v1/models/gamesr", scale=3)
+    assert gamesr in models and gamesr["recurrent"] and gamesr["card_markdown"].startswith("# gamesr x3") and gamesr["card"]
+    assert client.get("/api/v1/models/gamesr-openarena", params={"scale": 3}).status_code == 404
+
+
+def test_health_readiness_and_figures_for_prometheus(measured: tuple[httpx.Client, str], tmp_path: Path) -> None:
+    client, path = measured
+    assert read(client, "/health") == {"status": "ok", "runner": False, "version": "0.1.0"}
+    assert client.get("/ready").status_code == 200
+    client.get(path)
+    text = client.get("/metrics").text
+    assert f"gamesr_store_points {len(sweep_results())}.0" in text and "gamesr_sweeps_waiting 0.0" in text
+    assert 'gamesr_http_requests_total{method="GET",route="/sweeps/{sweep}",status="200"}' in text
+    assert 'gamesr_frame_seconds{height="1080",low_height="540",quantile="p95",stage="total",upscaler="gamesr"}' in text
+    with serving(settings(tmp_path)) as other:
+        (tmp_path / "store.sqlite").write_text("no database " * 100)
+        answer = other.get("/ready")
+        assert answer.status_code == 503 and other.get("/health").status_code == 200
+        assert "see the service's log" in answer.json()["detail"] and str(tmp_path) not in answer.text
+
+
+def test_players_latencies_are_posted_with_the_key_and_listed(tmp_path: Path) -> None:
+    with serving(settings(tmp_path, api_key=KEY)) as client:
+        for wrong in ({}, {"X-API-Key": "wrong"}, {"X-API-Key": KEY[:-1]}, {"X-API-Key": KEY[::-1]}):
+            answer = client.post("/api/v1/client-latencies", json=PLAYED, headers=wrong)
+            assert answer.status_code == 401 and answer.headers["www-authenticate"] == "X-API-Key"
+        answer = client.post("/api/v1/client-latencies", json=PLAYED, headers={"X-API-Key": KEY})
+        assert answer.status_code == 201, answer.text
+        (posted,) = read(client, "/api/v1/client-latencies")["latencies"]
+        assert posted == answer.json() and (posted["width"], posted["frames"]) == (1920, 50)
+        assert [(d["fps"], d["missed_share"]) for d in posted["deadlines"]] == [(30, 0.0), (60, 0.04), (120, 0.8)]
+        falls = {**PLAYED, "latency_us": {"total": {"count": 50, "p50": 9, "p95": 8, "p99": 10, "max": 11}}}
+        for unfit in (falls, {**PLAYED, "deadline_misses": {"60": 51}}, {**PLAYED, "more": 1}, {**PLAYED, "threads": "2"}, [], "x"):
+            assert client.post("/api/v1/client-latencies", json=unfit, headers={"X-API-Key": KEY}).status_code == 422
+        changes = [("POST", "sweeps"), ("POST", "sweeps/0123456789abcdef/cancel"), ("POST", "clips"), ("DELETE", "clips/x")]
+        for method, path in changes:
+            assert client.request(method, f"/api/v1/{path}").status_code == 401
+
+
+def test_keys_are_compared_in_constant_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    compared = []
+
+    def spied(one: bytes, other: bytes) -> bool:
+        compared.append((len(one), len(other)))
+        return hmac_compare(one, other)
+
+    hmac_compare = hmac.compare_digest
+    monkeypatch.setattr(guards.hmac, "compare_digest", spied)
+    assert guards.same_key(KEY, KEY) and not guards.same_key("", KEY) and not guards.same_key("k" * 1000, KEY)
+    assert compared == [(32, 32)] * 3
+
+
+def test_every_answer_says_what_a_browser_has_to_beware_of_and_no_other_origin_is_let_in(measured: tuple[httpx.Client, str]) -> None:
+    client, path = measured
+    for answer in (client.get(path), client.get("/nothing"), client.get("/"), client.post("/api/v1/sweeps", json={})):
+        policy = answer.headers["content-security-policy"]
+        assert "default-src 'none'" in policy and "script-src 'self'" in policy and "unsafe" not in policy
+        assert answer.headers["x-content-type-options"] == "nosniff" and answer.headers["x-frame-options"] == "DENY"
+        assert not any(name.startswith("access-control") for name in answer.headers) and "server" not in answer.headers
+    assert "access-control-allow-origin" not in client.get(path, headers={"Origin": "https://evil.example"}).headers
+    for headers in ({"Origin": "https://evil.example"}, {"Sec-Fetch-Site": "cross-site"}, {"Origin": "null"}):
+        assert client.post("/api/v1/client-latencies", json=PLAYED, headers=headers).status_code == 403
+    own = {"Origin": str(client.base_url).rstrip("/"), "Sec-Fetch-Site": "same-origin"}
+    assert client.post("/api/v1/client-latencies", json=PLAYED, headers=own).status_code == 201
+    assert client.get(path, headers={"Host": "evil.example"}).status_code == 403
+
+
+def test_errors_are_one_sentence_without_a_stack(
+    measured: tuple[httpx.Client, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client, path = measured
+    for answer, status in (
+        (client.get("/api/v1/sweeps/0123456789abcdef"), 404),
+        (client.get("/api/v1/sweeps/..%2f..%2fetc%2fpasswd"), 404),
+        (client.get(f"{path}/curves", params={"metric": "taste"}), 422),
+        (client.get(f"{path}/savings", params={"target": "nan"}), 422),
+        (client.put(path), 405),
+        (client.post("/api/v1/client-latencies", content=b"{" * 100), 422),
+        (client.post("/api/v1/client-latencies", content=b"x" * 100_000), 413),
+    ):
+        assert answer.status_code == status and list(answer.json()) == ["detail"] and "Traceback" not in answer.text
+    with serving(settings(tmp_path)) as other:
+        monkeypatch.setattr(StoreReader, "sweeps", lambda self: 1 / 0)
+        answer = other.get("/api/v1/sweeps")
+        assert answer.status_code == 500 and answer.json() == {"detail": "an error of the service: see its log"}
+
+
+def test_the_page_and_its_files_are_served_and_nothing_beside_them(measured: tuple[httpx.Client, str]) -> None:
+    client, _ = measured
+    assert "text/html" in client.get("/").headers["content-type"]
+    for path in ("/static/../app.py", "/static/..%2fapp.py", "/static/%2e%2e/app.py", "/static//etc/passwd", "/docs", "/redoc"):
+        assert client.get(path).status_code == 404
