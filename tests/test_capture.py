@@ -285,6 +285,17 @@ def test_a_size_that_does_not_match_goes_and_the_others_stay(scene: SceneSpec, t
     assert {path.name for path in (tmp_path / "out").rglob("*.mkv")} == {"one_216p.mkv", "one_72p.mkv"}
 
 
+def test_two_that_film_into_one_folder_keep_what_the_other_filmed(scene: SceneSpec, tmp_path: Path) -> None:
+    other = replace(scene, name="other")
+    one, two = Library(tmp_path / "out"), Library(tmp_path / "out")
+    for library, filming in ((one, scene), (two, other)):
+        *_, filmed = film_to_file(filming, Shot(72), tmp_path / "out", clock=Path(), display=":none", timeout_s=60)
+        assert not isinstance(filmed, Frame)
+        library.put(filming, Shot(72), filmed)
+    both = Library(tmp_path / "out")
+    assert both.entry(scene) is not None and both.entry(other) is not None
+
+
 def test_a_file_that_was_changed_is_found(scene: SceneSpec, tmp_path: Path) -> None:
     library = film_all(scene, tmp_path / "out", (216, 72))
     assert library.damage(scene) is None

@@ -71,7 +71,7 @@ def film(scene: SceneSpec, shot: Shot, *, clock: Path, display: str, timeout_s: 
     small = scene.game.small_windows
     window = (width, height) if small else (max(width, WINDOW[0]), max(height, WINDOW[1]))
     settings = {"FPS": scene.game.fps, "SKIP": scene.skip, "COUNT": scene.frames, "WIDTH": width, "HEIGHT": height}
-    settings |= {"SUPERSAMPLE": shot.supersample, "DRAWABLE": int(not small)}
+    settings |= {"SUPERSAMPLE": shot.supersample, "DRAWABLE": int(not small), "PACE_MS": scene.game.pace_ms}
     area = shot.width * shot.height
     read_fd, write_fd = os.pipe()
     # The game alone holds the writing end, so that the pipe ends when it does.

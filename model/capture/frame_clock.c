@@ -10,7 +10,8 @@
  *
  * Environment, each as GAMESR_...: PROCESS (name of the executable; any other is left alone), FD, FPS, SKIP, COUNT, WIDTH and HEIGHT (of
  * the picture that is read back, in the lower left corner of the window), SUPERSAMPLE, DRAWABLE (1: tell an SDL game that its window has that
- * size, for games that refuse small windows). COUNT=0 films nothing, rasterizes nothing and never ends the game.
+ * size, for games that refuse small windows), PACE_MS (real time that a frame lasts at least before SKIP, for games whose other threads load
+ * the world meanwhile). COUNT=0 films nothing, rasterizes nothing and never ends the game.
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -29,7 +30,7 @@ enum { UNRENDERED_UNTIL = 8 }; /* frames before the first picture that are rende
 
 static struct {
     int active, fd, supersample, drawable, width, height;
-    long skip, count;
+    long skip, count, pace_ms;
     double fps;
 } want;
 static long frame, taken;
@@ -50,6 +51,7 @@ __attribute__((constructor)) static void begin(void) {
     want.height = (int)number("GAMESR_HEIGHT", 0);
     want.supersample = (int)number("GAMESR_SUPERSAMPLE", 1);
     want.drawable = (int)number("GAMESR_DRAWABLE", 0);
+    want.pace_ms = number("GAMESR_PACE_MS", 0);
     want.active = 1;
 }
 
@@ -315,6 +317,10 @@ static void swapped(void) {
     frame++;
     if (!want.count || frame < want.skip - UNRENDERED_UNTIL) gl.Enable(GL_RASTERIZER_DISCARD);
     else if (frame == want.skip - UNRENDERED_UNTIL) gl.Disable(GL_RASTERIZER_DISCARD);
+    if (want.pace_ms && frame < want.skip) {
+        struct timespec pause = {want.pace_ms / 1000, want.pace_ms % 1000 * 1000000};
+        syscall(SYS_nanosleep, &pause, NULL);
+    }
     questions = 0;
     static int64_t late_ns; /* a game that slept for longer than a frame is late for good: its next frame is as long as any */
     int64_t due = late_ns + (int64_t)((double)frame * 1e9 / want.fps);

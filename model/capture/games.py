@@ -10,6 +10,8 @@
     world = [0.0, 0.1, 1.0, 0.8]            # left, top, right, bottom: where no HUD covers what is compared between sizes
     skip = 200                              # frames (buffer swaps) before the first that is filmed, and how many are filmed
     frames = 180
+    small_windows = true                    # optional: false for a game that refuses windows smaller than 1920x1080
+    pace_ms = 0                             # optional: real time a skipped frame lasts at least, where other threads load the world
 
     [play]                                  # how a scene is shown; [record] likewise makes its demo, where it has one
     command = ["/usr/games/openarena", "+set", "r_customwidth", "$width", "..."]
@@ -67,6 +69,7 @@ class Game:
     repeatable: bool
     world: tuple[float, float, float, float]
     small_windows: bool
+    pace_ms: int
     play: Run
     record: Run | None
     folder: Path
@@ -148,6 +151,7 @@ def _load(path: Path) -> list[SceneSpec]:
             repeatable=bool(table["repeatable"]),
             world=_world(table["world"]),
             small_windows=table.get("small_windows", True),
+            pace_ms=int(table.get("pace_ms", 0)),
             play=_run(table["play"]),
             record=_run(table["record"]) if "record" in table else None,
             folder=path.parent,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
 import json
 import os
@@ -70,7 +71,7 @@ class Entry:
 
 
 class Library:
-    """The scenes in one folder; the manifest is written whole after every change. Several threads may film into it at once."""
+    """The scenes in one folder; the manifest is written whole after every change, by several threads and processes if need be."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -91,11 +92,9 @@ class Library:
 
     def put(self, scene: SceneSpec, shot: Shot, filmed: Filmed) -> None:
         """Remember a file that was filmed."""
-        with self._lock:
-            entry = self.entry(scene) or Entry(scene.digest(), scene.game.licence)
-            entry.files[shot.name] = filmed
-            self._entries[scene.title] = entry
-        self.save()
+        entry = self.entry(scene) or Entry(scene.digest(), scene.game.licence)
+        entry.files[shot.name] = filmed
+        self._save(scene, entry)
 
     def judge(self, scene: SceneSpec) -> Entry:
         """Measure a filmed scene; throw its files away where it is still or empty, and single sizes that do not match the reference."""
@@ -114,7 +113,7 @@ class Library:
                     continue
                 entry.misaligned[name] = objection
             other.unlink(missing_ok=True)
-        self.save()
+        self._save(scene, entry)
         return entry
 
     def require(self, scene: SceneSpec) -> Entry:
@@ -177,10 +176,12 @@ class Library:
         partial.replace(path)
         return path
 
-    def save(self) -> None:
-        """Write the manifest, whole or not at all."""
-        with self._lock:
-            partial = self.folder / f".{MANIFEST}.{os.getpid()}.part"
+    def _save(self, scene: SceneSpec, entry: Entry) -> None:
+        """Write the manifest with this entry in it, whole or not at all; what others have added meanwhile stays."""
+        with self._lock, (self.folder / f".{MANIFEST}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            self._entries = _read(self.folder / MANIFEST) | {scene.title: entry}
+            partial = self.folder / f".{MANIFEST}.part"
             partial.write_text(json.dumps({title: asdict(self._entries[title]) for title in sorted(self._entries)}, indent=1) + "\n")
             partial.replace(self.folder / MANIFEST)
 
