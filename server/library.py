@@ -76,7 +76,7 @@ class Library:
     def uploads(self) -> int:
         return sum(name.startswith(UPLOADED) for name in self._files())
 
-    def take_in(self, uploaded: Path, suffix: str, title: str | None) -> StoredClip:
+    def take_in(self, uploaded: Path, suffix: str, title: str) -> StoredClip:
         """Look at an uploaded file and keep it under a name of ours; raises InputError for what is no usable clip.
 
         The same clip a second time is the first one again. The file is moved or left to the caller to remove.

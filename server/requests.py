@@ -4,16 +4,24 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.config import JsonDict
 
 from server.schemas import Deadline, Schema, StageLatency
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,95}$"
 ClipName = Annotated[str, Field(pattern=NAME, description="as /api/v1/clips lists it")]
-Kbps = Annotated[int, Field(ge=1, le=1_000_000)]
-Lines = Annotated[int, Field(ge=2, le=8192)]
 UpscalerName = Annotated[str, Field(pattern=NAME, description="none for native resolution, or a model of /api/v1/models")]
+
+
+def _whole(value: object) -> object:
+    """JSON has one kind of number: 2.0 is a whole one."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+WholeNumber = Annotated[int, BeforeValidator(_whole)]
+Kbps = Annotated[WholeNumber, Field(ge=1, le=1_000_000)]
+Lines = Annotated[WholeNumber, Field(ge=2, le=8192)]
 
 
 def _distinct(values: list[Any]) -> list[Any]:
@@ -43,8 +51,10 @@ class SweepRequest(Sent):
         default_factory=lambda: ["none", "bicubic", "lanczos", "fsr1", "gamesr"]
     )
     low_heights: Annotated[list[Lines], Field(min_length=1, max_length=4, json_schema_extra=_UNIQUE), _DISTINCT] | None = None
-    fps: Annotated[int, Field(ge=1, le=1000, description="a whole part of the clips' own rate, null for that rate")] | None = None
-    frames: Annotated[int, Field(ge=1, le=1_000_000, description="the most frames of a clip that count, null for all")] | None = None
+    fps: Annotated[WholeNumber, Field(ge=1, le=1000, description="a whole part of the clips' own rate, null for that rate")] | None = None
+    frames: Annotated[WholeNumber, Field(ge=1, le=1_000_000, description="the most of a clip that count, null for all")] | None = None
+        None
+    )
 
 
 class StoredClip(Schema):
@@ -71,7 +81,7 @@ class ClipList(Schema):
 class StageLatencySent(Sent):
     """Percentiles in microseconds over `count` frames; they rise."""
 
-    count: Annotated[int, Field(ge=1, le=10**9)]
+    count: Annotated[WholeNumber, Field(ge=1, le=10**9)]
     p50: Annotated[float, Field(ge=0, le=1e9)]
     p95: Annotated[float, Field(ge=0, le=1e9)]
     p99: Annotated[float, Field(ge=0, le=1e9)]
@@ -103,13 +113,13 @@ class ClientLatencyRequest(Sent):
     model_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     precision: Annotated[str, Field(pattern=NAME)] = "float32"
     provider: Literal["cpu", "cuda", "openvino"]
-    threads: Annotated[int, Field(ge=1, le=1024)]
+    threads: Annotated[WholeNumber, Field(ge=1, le=1024)]
     machine: Word
-    low_width: Annotated[int, Field(ge=1, le=8192)]
-    low_height: Annotated[int, Field(ge=1, le=8192)]
-    scale: Literal[2, 3]
+    low_width: Annotated[WholeNumber, Field(ge=1, le=8192)]
+    low_height: Annotated[WholeNumber, Field(ge=1, le=8192)]
+    scale: Annotated[WholeNumber, Field(ge=2, le=3)]
     latency_us: StagesSent
-    deadline_misses: dict[Literal["30", "60", "120"], Annotated[int, Field(ge=0, le=10**9)]] = Field(
+    deadline_misses: dict[Literal["30", "60", "120"], Annotated[WholeNumber, Field(ge=0, le=10**9)]] = Field(
         description="frames that took longer in total than one frame lasts, by frame rate"
     )
 

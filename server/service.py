@@ -54,6 +54,7 @@ def _of(request: Request) -> Service:
 Shared = Annotated[Service, Depends(_of)]
 
 _WORDS = {
+    400: "The body is no text",
     401: "The API key is missing or wrong",
     403: "A page of another origin asks, or this machine is not asked by its own name",
     404: "There is no such thing",

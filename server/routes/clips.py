@@ -55,7 +55,7 @@ def list_clips(service: Shared) -> ClipList:
 async def upload_clip(
     request: Request,
     service: Shared,
-    title: Annotated[str | None, Query(min_length=1, max_length=120, pattern=r"^[^\x00-\x1f\x7f]+$", description="for people")] = None,
+    title: Annotated[str | None, Query(max_length=120, description="what people call it")] = None,
 ) -> StoredClip:
     """Keep a clip, once all of it could be decoded within the limits. The same file twice is one clip."""
     kind = request.headers.get("content-type", "").split(";")[0].strip().lower()
@@ -68,7 +68,8 @@ async def upload_clip(
         if await to_thread.run_sync(service.library.uploads) >= service.settings.limits.uploads_kept:
             raise HTTPException(409, f"{service.settings.limits.uploads_kept} uploads are kept already: delete one first")
         await _receive(request, part, service)
-        return await to_thread.run_sync(service.library.take_in, part, SUFFIXES[kind], title)
+        shown = "".join(letter for letter in title or "" if letter.isprintable())
+        return await to_thread.run_sync(service.library.take_in, part, SUFFIXES[kind], shown)
     except InputError as error:
         service.monitoring.uploads_refused.inc()
         raise HTTPException(422, str(error)) from None

@@ -17,7 +17,7 @@ def list_client_latencies(service: Shared) -> ClientLatencyList:
     return ClientLatencyList(latencies=service.players.newest())
 
 
-@router.post("", status_code=201, responses=problems(401, 408, 413), dependencies=[Depends(require_key)])
+@router.post("", status_code=201, responses=problems(400, 401, 408, 413), dependencies=[Depends(require_key)])
 def post_client_latency(posted: ClientLatencyRequest, service: Shared) -> ClientLatency:
     """One summary of one player's client."""
     return service.players.add(posted)

@@ -23,8 +23,13 @@ from server.service import Service, Shared, problems
 SweepId = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", description="as /api/v1/sweeps lists it")]
 _POLL_S = 0.3
 _SIGN_OF_LIFE_S = 15.0
+_EVENT = {
+    "type": "object",
+    "properties": {"event": {"const": "progress"}, "data": {"type": "string", "contentMediaType": "application/json"}},
+    "required": ["event", "data"],
+}
 _EVENTS: dict[int | str, dict[str, Any]] = {
-    200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}, "description": "events `progress`, each a Progress"}
+    200: {"content": {"text/event-stream": {"schema": _EVENT}}, "description": "events `progress`; the data of each is a Progress"}
 }
 
 router = APIRouter(prefix="/sweeps", tags=["sweeps"])
@@ -36,7 +41,7 @@ def list_sweeps(service: Shared) -> SweepList:
     return SweepList(sweeps=service.sweeps.all())
 
 
-@router.post("", status_code=202, responses=problems(401, 404, 408, 413, 429), dependencies=[Depends(require_key)])
+@router.post("", status_code=202, responses=problems(400, 401, 404, 408, 413, 429), dependencies=[Depends(require_key)])
 def start_sweep(asked: SweepRequest, service: Shared) -> Sweep:
     """Put a sweep into the queue; it runs in a process of its own when those before it are over."""
     clips = [find_clip(service, name) for name in asked.clips]
