@@ -53,8 +53,6 @@ class SweepRequest(Sent):
     low_heights: Annotated[list[Lines], Field(min_length=1, max_length=4, json_schema_extra=_UNIQUE), _DISTINCT] | None = None
     fps: Annotated[WholeNumber, Field(ge=1, le=1000, description="a whole part of the clips' own rate, null for that rate")] | None = None
     frames: Annotated[WholeNumber, Field(ge=1, le=1_000_000, description="the most of a clip that count, null for all")] | None = None
-        None
-    )
 
 
 class StoredClip(Schema):
