@@ -7,7 +7,8 @@ import { NATIVE, label } from "./looks.js";
 import { Viewer } from "./viewer.js";
 
 const REFERENCE = "reference";
-const PREFERRED = { left: ["bicubic", NATIVE], right: ["gamesr"] };
+const OURS = "gamesr";
+const BASELINES = ["bicubic", NATIVE];
 
 export class Frames {
   #fields;
@@ -18,6 +19,7 @@ export class Frames {
   #points = [];
   #height = 0;
   #waiting = new AbortController();
+  #chosen = new Set(); // fields that somebody set
   #seen = false; // nothing is encoded for those who never look
   #shown = "";
 
@@ -27,24 +29,29 @@ export class Frames {
     this.#captions = { left: root.querySelector("#caption-left"), right: root.querySelector("#caption-right") };
     this.#status = field("status");
     this.#viewer = new Viewer(root.querySelector(".viewer"));
-    for (const each of Object.values(this.#fields)) each.addEventListener("change", () => this.#load());
+    for (const each of Object.values(this.#fields)) {
+      each.addEventListener("change", () => {
+        this.#chosen.add(each);
+        this.#load();
+      });
+    }
     new IntersectionObserver(([entry]) => {
       this.#seen = entry.isIntersecting;
       this.#load();
     }).observe(root);
   }
 
-  /** Offers what was swept from `height`; what is chosen stays chosen where it is still there. */
+  /** Offers what was swept from `height`; what somebody chose stays chosen where it is still there. */
   show(sweep, points, height) {
     [this.#sweep, this.#points, this.#height] = [sweep, points, height];
     const upscalers = [...new Set(points.filter((point) => point.upscaler === NATIVE || point.low_height === height).map((point) => point.upscaler))];
     const pictures = [REFERENCE, ...upscalers];
-    offer(this.#fields.clip, sweep.clips.map((clip) => [clip.clip, clip.clip]));
-    offer(this.#fields.bitrate, sweep.bitrates_kbps.map((kbps) => [kbps, `${mbps(kbps)} Mbit/s`]), middle(sweep.bitrates_kbps));
-    for (const side of ["left", "right"]) {
-      const first = PREFERRED[side].find((name) => pictures.includes(name));
-      offer(this.#fields[side], pictures.map((name) => [name, label(name)]), first ?? pictures.at(-1));
-    }
+    this.#offer(this.#fields.clip, sweep.clips.map((clip) => [clip.clip, clip.clip]), sweep.clips[0]?.clip);
+    this.#offer(this.#fields.bitrate, sweep.bitrates_kbps.map((kbps) => [kbps, `${mbps(kbps)} Mbit/s`]), middle(sweep.bitrates_kbps));
+    const names = pictures.map((name) => [name, label(name)]);
+    const right = pictures.includes(OURS) ? OURS : pictures.at(-1);
+    this.#offer(this.#fields.right, names, right);
+    this.#offer(this.#fields.left, names, BASELINES.find((name) => name !== right && pictures.includes(name)));
     this.#load();
   }
 
@@ -53,6 +60,7 @@ export class Frames {
     this.#fields.clip.value = point.clip;
     this.#fields.bitrate.value = String(point.requested_kbps);
     this.#fields.right.value = point.upscaler;
+    for (const field of ["clip", "bitrate", "right"]) this.#chosen.add(this.#fields[field]);
     this.#load();
   }
 
@@ -85,7 +93,8 @@ export class Frames {
   }
 
   #path(clip, name) {
-    const path = `frames/${encodeURIComponent(clip.source)}/${this.#fields.number.value}?picture=${encodeURIComponent(name)}`;
+    const frame = `${encodeURIComponent(clip.source)}/${this.#fields.number.value}`;
+    const path = `frames/${frame}?picture=${encodeURIComponent(name)}&fps=${clip.fps}`;
     if (name === REFERENCE) return path;
     const height = name === NATIVE ? clip.height : this.#height;
     return `${path}&low_height=${height}&bitrate_kbps=${this.#fields.bitrate.value}`;
@@ -106,17 +115,16 @@ export class Frames {
     return `${label(name)} ${point.low_height}p, ${mbps(point.bitrate_kbps)} Mbit/s${vmaf}`;
   }
 
+  #offer(select, options, first) {
+    const values = options.map(([value]) => String(value));
+    const kept = this.#chosen.has(select) && values.includes(select.value) ? select.value : first;
+    select.replaceChildren(...options.map(([value, text]) => element("option", { value: String(value) }, text)));
+    if (kept !== undefined) select.value = String(kept);
+  }
+
   #say(sentence) {
     this.#status.textContent = sentence;
   }
-}
-
-function offer(select, options, first) {
-  const chosen = select.value;
-  select.replaceChildren(...options.map(([value, text]) => element("option", { value: String(value) }, text)));
-  const values = options.map(([value]) => String(value));
-  if (values.includes(chosen)) select.value = chosen;
-  else if (first !== undefined) select.value = String(first);
 }
 
 function middle(values) {

@@ -138,6 +138,7 @@ function table(rows) {
   return element(
     "table",
     {},
+    element("caption", {}, "Percentiles, and the share of frames that missed a deadline"),
     element(
       "thead",
       {},
