@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import re
 import secrets
 import threading
@@ -20,6 +21,8 @@ from server.settings import Settings
 
 UPLOADED = "upload-"
 SUFFIXES = (".mp4", ".mkv", ".mov", ".webm", ".ts", ".avi", ".h264", ".ivf", ".y4m")  # of a folder's clips
+_LOOK_S = 5.0
+_LOG = logging.getLogger(__name__)
 _LOOKED_AT = threading.Lock()  # one process looks at a clip at a time
 
 
@@ -32,6 +35,13 @@ class Library:
 
     def __init__(self, database: Database, settings: Settings) -> None:
         self._database, self._settings = database, settings
+        self._looked = threading.Event()
+        self._looked.set()
+
+    def look_at_all(self) -> None:
+        """Begin to look at the clips of the folder, so that sweeps find theirs among them."""
+        self._looked.clear()
+        threading.Thread(target=self._look_at_all, daemon=True).start()
 
     def clips(self) -> tuple[list[StoredClip], dict[str, str]]:
         """Every clip, and the files of the folder that cannot be used with the reason why."""
@@ -68,7 +78,8 @@ class Library:
         return self._files().get(name)
 
     def known_names(self) -> dict[str, str]:
-        """By sha256, the clips that have been looked at before."""
+        """By sha256, the clips that have been looked at; waits a moment for those that are just being looked at."""
+        self._looked.wait(_LOOK_S)
         there = self._files()
         rows = self._database.rows("SELECT name, known FROM clips WHERE known IS NOT NULL")
         return {str(json.loads(known)["sha256"]): str(name) for name, known in rows if name in there}
@@ -102,6 +113,14 @@ class Library:
             path.unlink(missing_ok=True)
             with self._database.transaction() as connection:
                 connection.execute("DELETE FROM clips WHERE name = ?", (name,))
+
+    def _look_at_all(self) -> None:
+        try:
+            self.clips()
+        except OutputError as error:
+            _LOG.error("%s", error)
+        finally:
+            self._looked.set()
 
     def _files(self) -> dict[str, Path]:
         in_folder = [path for path in _usable(self._settings.clips) if path.suffix.lower() in SUFFIXES]

@@ -37,6 +37,7 @@ class Service:
         self.reader.totals()  # a store that is none of ours is said now
         self.queue = SweepQueue(database, most=limits.queued_sweeps, kept=limits.kept_sweeps)
         self.library = Library(database, settings)
+        self.library.look_at_all()
         self.sweeps = Sweeps(self.reader, self.queue, self.library)
         self.players = Players(database, kept=limits.kept_client_latencies)
         self.stills = Stills(settings.frames, most=limits.frames_at_once, kept_bytes=limits.frames_kept_bytes)
