@@ -92,7 +92,8 @@ def settings_of(arguments: argparse.Namespace, key: str | None) -> Settings:
 
 def serve(arguments: argparse.Namespace) -> None:
     """Until a signal comes; raises GamesrError where it cannot begin."""
-    settings = settings_of(arguments, os.environ.get(KEY_VARIABLE) or None)
+    # Out of the environment: what decodes anybody's clips has no need to know it.
+    settings = settings_of(arguments, os.environ.pop(KEY_VARIABLE, None) or None)
     try:
         import uvicorn
 

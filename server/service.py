@@ -27,7 +27,7 @@ class Service:
         self.settings, limits = settings, settings.limits
         try:
             for folder in (settings.data, settings.uploads, settings.frames):
-                folder.mkdir(parents=True, exist_ok=True)
+                folder.mkdir(mode=0o700, parents=True, exist_ok=True)  # clips may be nobody else's business
             for part in settings.uploads.glob("*.part"):
                 part.unlink()
         except OSError as error:

@@ -9,6 +9,7 @@ import socket
 import subprocess
 from pathlib import Path
 
+import psutil
 import pytest
 
 from server import serve
@@ -71,6 +72,8 @@ def test_every_line_of_the_documentation_works_and_there_is_one_for_every_addres
             check=False,
         )
         assert done.returncode == 0, done.stderr[-3000:]
+        for process in (own := psutil.Process(command.pid)).children(recursive=True):
+            assert KEY not in process.environ().values() and KEY in own.environ().values()
         assert '"state":"done"' in done.stdout and (tmp_path / "frame.png").read_bytes().startswith(b"\x89PNG")
         metrics = command.client.get("/metrics").text
         for path, operations in command.client.get("/api/v1/openapi.json").json()["paths"].items():

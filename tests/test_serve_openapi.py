@@ -37,6 +37,7 @@ def test_no_5xx_and_every_answer_as_described(make_clip: Callable[..., Path], tm
             *(str(Path(sys.executable).with_name("schemathesis")), "--config-file", str(tmp_path / "schemathesis.toml")),
             *("run", description, "--header", f"X-API-Key: {KEY}", "--phases", "fuzzing,stateful", "--max-examples", str(EXAMPLES)),
             *("--workers", "2", "--continue-on-failure", "--seed", str(seed), "--suppress-health-check", "all", "--no-color"),
+            *("--request-timeout", "60"),
         ]
         environment = os.environ | {"SCHEMATHESIS_HOOKS": "tests.fuzzing", "GAMESR_FUZZ_CLIP": str(clip), "GAMESR_FUZZ_SWEEP": sweep}
         environment["PYTHONPATH"] = str(ROOT)
