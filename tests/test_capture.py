@@ -233,7 +233,9 @@ def film_all(scene: SceneSpec, folder: Path, heights: tuple[int, ...] = HEIGHTS)
 
 def test_what_is_filmed_is_kept_described_and_not_filmed_again(scene: SceneSpec, tmp_path: Path) -> None:
     library = film_all(scene, tmp_path / "out")
+    assert library.is_unmeasured(scene) and not library.kept(scene)  # as it is when stopped in between
     entry = library.judge(scene)
+    assert not library.is_unmeasured(scene) and library.kept(scene)
     assert entry.objection() is None and entry.kept_files() == ["216p", "108p", "72p"]
     assert "108p aligned by" in entry.verdict()
     again = Library(tmp_path / "out")
@@ -283,6 +285,8 @@ def test_a_size_that_does_not_match_goes_and_the_others_stay(scene: SceneSpec, t
     entry = library.judge(scene)
     assert entry.kept_files() == ["216p", "72p"] and "108p thrown away" in entry.verdict()
     assert {path.name for path in (tmp_path / "out").rglob("*.mkv")} == {"one_216p.mkv", "one_72p.mkv"}
+    again = Library(tmp_path / "out")
+    assert again.missing(scene, shots_of(scene, HEIGHTS)) == [] and again.judge(scene) == entry
 
 
 def test_two_that_film_into_one_folder_keep_what_the_other_filmed(scene: SceneSpec, tmp_path: Path) -> None:

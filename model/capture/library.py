@@ -90,29 +90,33 @@ class Library:
             return shots
         return [] if entry.rejected else [shot for shot in shots if not self._is_there(entry, shot)]
 
+    def is_unmeasured(self, scene: SceneSpec) -> bool:
+        """Was the scene filmed, but not measured since (stopped in between)?"""
+        entry = self.entry(scene)
+        return entry is not None and entry.liveliness is None
+
     def put(self, scene: SceneSpec, shot: Shot, filmed: Filmed) -> None:
         """Remember a file that was filmed."""
         entry = self.entry(scene) or Entry(scene.digest(), scene.game.licence)
         entry.files[shot.name] = filmed
+        entry.liveliness = None
+        entry.misaligned.pop(shot.name, None)
         self._save(scene, entry)
 
     def judge(self, scene: SceneSpec) -> Entry:
         """Measure a filmed scene; throw its files away where it is still or empty, and single sizes that do not match the reference."""
-        entry = self._entries[scene.title]
-        names = sorted(entry.files, key=_rank)
-        reference = self.folder / entry.files[names[0]].path
-        entry.liveliness = liveliness(reference, scene.game.fps)
+        entry = self.require(scene)
+        reference, *others = entry.kept_files()
+        entry.liveliness = liveliness(self.folder / entry.files[reference].path, scene.game.fps)
         entry.rejected = entry.liveliness.objection()
-        entry.alignment, entry.misaligned = {}, {}
-        for name in names if entry.rejected else names[1:]:
-            other = self.folder / entry.files[name].path
-            if entry.rejected is None:
-                entry.alignment[name] = found = alignment(reference, other, scene.game.world)
-                objection = found.objection()
-                if objection is None:
-                    continue
+        for name in others if entry.rejected is None else ():
+            found = alignment(self.folder / entry.files[reference].path, self.folder / entry.files[name].path, scene.game.world)
+            entry.alignment[name] = found
+            objection = found.objection()
+            if objection is not None:
                 entry.misaligned[name] = objection
-            other.unlink(missing_ok=True)
+        for name in entry.files if entry.rejected else entry.misaligned:
+            (self.folder / entry.files[name].path).unlink(missing_ok=True)
         self._save(scene, entry)
         return entry
 

@@ -61,15 +61,14 @@ def render(scenes: Sequence[SceneSpec], library: Library, heights: Sequence[int]
     Raises GamesrError where nothing can be filmed at all (no X server, no compiler).
     """
     missing = [(scene, library.missing(scene, shots_of(scene, heights))) for scene in scenes]
-    todo = [(scene, shots) for scene, shots in missing if shots]
+    todo = [(scene, shots) for scene, shots in missing if shots or library.is_unmeasured(scene)]
     if not todo:
         return
     library.folder.mkdir(parents=True, exist_ok=True)
     clock = build_frame_clock(CLOCKS)
     events: queue.Queue[Event] = queue.Queue()
     stop = threading.Event()
-    top = max(shot.height * shot.supersample for _, shots in todo for shot in shots)
-    screen = Shot(max(top, WINDOW[1]))
+    screen = Shot(max([WINDOW[1], *(shot.height * shot.supersample for _, shots in todo for shot in shots)]))
     with hidden_display(screen.width, screen.height) as display, ThreadPoolExecutor(jobs) as pool:
 
         def work(scene: SceneSpec, shots: Sequence[Shot]) -> None:
