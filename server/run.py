@@ -24,7 +24,7 @@ from server.events import (
 from server.following import end_with_parent
 from server.library import Library
 from server.plan import Request, make_plan
-from server.queue import QueuedSweep, SweepQueue
+from server.queue import QueuedSweep, SweepQueue, fresh_progress
 from server.schemas import Failure, Progress
 from server.settings import Settings
 from server.store import Store
@@ -88,19 +88,7 @@ class Tracker:
         self._begin = time.monotonic()
         self._measured = 0
         self.failures: list[Failure] = []
-        self.progress = Progress(
-            state="running",
-            points_total=None,
-            points_done=0,
-            points_failed=0,
-            latencies_total=None,
-            latencies_done=0,
-            latencies_failed=0,
-            elapsed_s=0.0,
-            remaining_s=None,
-            waiting=None,
-            reason=None,
-        )
+        self.progress = fresh_progress("running")
 
     def take(self, event: Event) -> None:
         before, change = self.progress, dict[str, object](waiting=None)
@@ -139,5 +127,5 @@ def _without_paths(sentence: str, paths: dict[str, Path | None]) -> str:
     """The names that the caller knows in the place of files that are none of its business."""
     for name, path in paths.items():
         if path is not None:
-            sentence = sentence.replace(str(path), name)
+            sentence = sentence.replace(str(path.absolute()), name).replace(str(path), name)
     return sentence

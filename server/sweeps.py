@@ -14,7 +14,7 @@ from server.library import Library
 from server.points import LatencyResult, PointResult
 from server.queue import QueuedSweep, SweepQueue, fresh_progress
 from server.reading import KeptSweep, StoreReader
-from server.schemas import ClipOfSweep, Progress, Sweep
+from server.schemas import ClipOfSweep, Progress, Sweep, SweepState
 
 _ID_DIGITS = 16
 _KEPT_ANSWERS = 256
@@ -27,6 +27,7 @@ class Sweeps:
     def __init__(self, reader: StoreReader, queue: SweepQueue, library: Library) -> None:
         self._reader, self._queue, self._library = reader, queue, library
         self._answers: OrderedDict[tuple[Any, ...], bytes] = OrderedDict()
+        self._whole: set[str] = set()
         self._lock = Lock()
 
     def all(self) -> list[Sweep]:
@@ -50,7 +51,7 @@ class Sweeps:
         if queued is not None:
             return queued.progress
         found = self._reader.sweep(sweep)
-        return None if found is None else self._progress(found[1].asked)
+        return None if found is None else self._progress(found[0], found[1].asked)
 
     def answer(
         self, sweep: str, build: Callable[[Sequence[PointResult], Sequence[LatencyResult]], BaseModel], *about: object
@@ -96,21 +97,19 @@ class Sweeps:
             upscalers=list(kept.asked.upscalers),
             low_heights=list(kept.asked.low_heights),
             bitrates_kbps=list(kept.asked.bitrates_kbps),
-            progress=self._progress(kept.asked),
+            progress=self._progress(key, kept.asked),
             failures=[],
         )
 
-    def _progress(self, asked: AskedSweep) -> Progress:
+    def _progress(self, key: str, asked: AskedSweep) -> Progress:
         """As far as the store shows; what failed is known to the command only."""
-        points, latencies = self._reader.counts(asked)
         totals = len({point.key for point in asked.points}), len(set(asked.latencies))
-        change = {
-            "points_total": totals[0],
-            "points_done": points,
-            "latencies_total": totals[1],
-            "latencies_done": latencies,
-        }
-        return fresh_progress("done" if (points, latencies) == totals else "partial").model_copy(update=change)
+        points, latencies = totals if key in self._whole else self._reader.counts(asked)
+        if (points, latencies) == totals:
+            self._whole.add(key)  # and stays so
+        state: SweepState = "done" if key in self._whole else "partial"
+        change = {"points_total": totals[0], "points_done": points, "latencies_total": totals[1], "latencies_done": latencies}
+        return fresh_progress(state).model_copy(update=change)
 
 
 def _of_queue(queued: QueuedSweep, kept: KeptSweep | None, sources: dict[str, str]) -> Sweep:

@@ -23,7 +23,7 @@ from server.settings import Limits, Settings
 
 KEY = "a key of more than sixteen characters"
 ROOT = Path(__file__).parent.parent
-WAIT_S = 60.0
+WAIT_S = 120.0
 
 
 def settings(folder: Path, *, clips: Path | None = None, api_key: str | None = None, loopback: bool = True, **limits: Any) -> Settings:
