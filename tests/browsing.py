@@ -15,9 +15,9 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.remote.webelement import WebElement
 from selenium.webdriver.support.wait import WebDriverWait
 
-WAIT_S = 60
+WAIT_S = 120
 # Root, which a container's gate is, may not have Chromium's sandbox; and its /dev/shm is small.
-_SWITCHES = ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--disable-gpu", "--lang=en-US")
+_SWITCHES = ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--disable-gpu", "--hide-scrollbars", "--lang=en-US")
 
 
 class Page:
@@ -26,7 +26,7 @@ class Page:
     def __init__(self, driver: webdriver.Chrome) -> None:
         self.driver = driver
 
-    def open(self, url: str, *, width: int = 1280, height: int = 900, dark: bool = False, pixels: int = 1) -> None:
+    def open(self, url: str, *, width: int = 1280, height: int = 900, dark: bool = False, pixels: float = 1) -> None:
         size = {"width": width, "height": height, "deviceScaleFactor": pixels, "mobile": width < 500}
         self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
         features = [

@@ -36,7 +36,7 @@ export class Curves {
       const panel = this.#panels.get(clip) ?? this.#panel(clip);
       const shown = seriesOf(points, clip, choice, looks);
       panel.title.textContent = titleOf(clip, points, choice.height);
-      panel.missing.replaceChildren(...shown.missing.map((reason) => element("li", {}, reason)));
+      panel.remarks.replaceChildren(...shown.remarks.map((reason) => element("li", {}, reason)));
       panel.chart.show({
         series: shown.series,
         grades: metric.graded ? GRADES : [],
@@ -56,27 +56,29 @@ export class Curves {
   }
 
   #panel(clip) {
-    const [title, missing] = [element("h3"), element("ul", { className: "notes" })];
+    const [title, remarks] = [element("h3"), element("ul", { className: "notes" })];
     const [plot, reading] = [element("div", { className: "plot" }), element("p", { className: "reading", role: "status" }, HINT)];
     const chart = new Chart(plot, {
       onRead: (series, index) => (reading.textContent = series ? inWords(series.points[index].of) : HINT),
       onPick: (series, index) => this.#onPick(series.points[index].of),
     });
-    return { root: element("div", { className: "panel" }, title, plot, reading, missing), title, missing, chart };
+    return { root: element("div", { className: "panel" }, title, plot, reading, remarks), title, remarks, chart };
   }
 }
 
 function seriesOf(points, clip, choice, looks) {
   const quality = (point) => point.quality[choice.metric];
-  const missing = new Set();
+  const remarks = new Map(); // what is to be said of points, and the curves of which it is true
+  const say = (sentence, upscaler) => remarks.set(sentence, [...(remarks.get(sentence) ?? []), label(upscaler)]);
   const series = choice.upscalers.map((upscaler) => {
     const own = points
       .filter((point) => point.clip === clip && point.upscaler === upscaler && (upscaler === NATIVE || point.low_height === choice.height))
       .sort((one, other) => one.bitrate_kbps - other.bitrate_kbps);
     for (const point of own) {
       const reason = point.quality.undefined[choice.metric];
-      if (reason) missing.add(`${label(upscaler)} at ${mbps(point.bitrate_kbps)} Mbit/s is not drawn: ${reason}.`);
-      for (const flag of point.flags) missing.add(`${label(upscaler)}, asked for ${mbps(point.requested_kbps)} Mbit/s: ${flag}.`);
+      const asked = `Asked for ${mbps(point.requested_kbps)} Mbit/s`;
+      if (reason) say(`${asked}, not drawn: ${reason}`, upscaler);
+      for (const flag of point.flags) say(`${asked}: ${flag}`, upscaler);
     }
     const drawn = own.filter((point) => quality(point) !== null);
     return {
@@ -85,7 +87,7 @@ function seriesOf(points, clip, choice, looks) {
       points: drawn.map((point) => ({ mbps: point.bitrate_kbps / 1000, quality: quality(point), of: point })),
     };
   });
-  return { series, missing: [...missing] };
+  return { series, remarks: [...remarks].map(([sentence, upscalers]) => `${sentence} (${upscalers.join(", ")}).`) };
 }
 
 function titleOf(clip, points, height) {

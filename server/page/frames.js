@@ -1,12 +1,13 @@
 // Which two pictures the viewer shows: reference, native or an upscaler's, of one frame of one clip at one bitrate.
 
-import { picture } from "./api.js";
+import { get, picture } from "./api.js";
 import { element } from "./dom.js";
 import { METRICS, mbps } from "./curves.js";
 import { NATIVE, label } from "./looks.js";
 import { Viewer } from "./viewer.js";
 
 const REFERENCE = "reference";
+const FIRST = 10; // a network that remembers has something to remember by then
 const OURS = "gamesr";
 const BASELINES = ["bicubic", NATIVE];
 
@@ -21,6 +22,7 @@ export class Frames {
   #waiting = new AbortController();
   #chosen = new Set(); // fields that somebody set
   #seen = false; // nothing is encoded for those who never look
+  #clips = null; // the service's answer
   #shown = "";
 
   constructor(root) {
@@ -71,14 +73,16 @@ export class Frames {
     const { signal } = this.#waiting;
     const clip = this.#sweep.clips.find((each) => each.clip === this.#fields.clip.value);
     if (!clip) return this.#say("This sweep has no clip yet.");
-    if (clip.source === null) return this.#say("The service has measurements of this clip, but not its file: no pictures.");
-    if (clip.frames !== null) this.#fields.number.max = clip.frames - 1;
+    this.#limitNumber(clip);
     if (!this.#fields.number.reportValidity()) return;
     const sides = ["left", "right"].map((side) => this.#fields[side].value);
-    const paths = sides.map((name) => this.#path(clip, name));
-    if (paths.join() === this.#shown) return this.#say("");
-    this.#say("Encoding and upscaling up to this frame …");
     try {
+      const source = clip.source ?? (await this.#sourceOf(clip.sha256));
+      if (signal.aborted) return;
+      if (source === undefined) return this.#say("The service has measurements of this clip, but not its file: no pictures.");
+      const paths = sides.map((name) => this.#path(source, clip, name));
+      if (paths.join() === this.#shown) return this.#say("");
+      this.#say("Encoding and upscaling up to this frame …");
       const urls = await Promise.all(paths.map((path) => picture(path, signal)));
       if (signal.aborted) return;
       const [left, right] = sides.map((name, index) => ({ url: urls[index], name: this.#caption(clip, name) }));
@@ -92,8 +96,23 @@ export class Frames {
     }
   }
 
-  #path(clip, name) {
-    const frame = `${encodeURIComponent(clip.source)}/${this.#fields.number.value}`;
+  /** A service that has just been started knows no clip by its content before somebody asks it for its clips. */
+  async #sourceOf(sha256) {
+    this.#clips ??= get("clips");
+    this.#clips.catch(() => (this.#clips = null));
+    return (await this.#clips).clips.find((clip) => clip.sha256 === sha256)?.name;
+  }
+
+  /** To the frames that were measured. */
+  #limitNumber(clip) {
+    const { number } = this.#fields;
+    const frames = Math.max(1, ...this.#points.filter((point) => point.clip === clip.clip).map((point) => point.quality.frames));
+    number.max = frames - 1;
+    if (!this.#chosen.has(number)) number.value = Math.min(FIRST, frames - 1);
+  }
+
+  #path(source, clip, name) {
+    const frame = `${encodeURIComponent(source)}/${this.#fields.number.value}`;
     const path = `frames/${frame}?picture=${encodeURIComponent(name)}&fps=${clip.fps}`;
     if (name === REFERENCE) return path;
     const height = name === NATIVE ? clip.height : this.#height;

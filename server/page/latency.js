@@ -8,7 +8,7 @@ const ROW = 26;
 const BAR = 14;
 const TOP = 34;
 const BOTTOM = 36;
-const LEAST_MS = 1;
+const LEAST_MS = 0.5;
 const NAMES_BESIDE_FROM = 560; // narrower than this, names stand above their bars
 const NAMES = 190;
 const MOST_PLAYERS = 20; // the newest
@@ -36,7 +36,7 @@ export class Latency {
       this.#holder.replaceChildren(element("p", { className: "empty" }, "No latency was measured for this choice, and no client has posted any."));
       return;
     }
-    this.#holder.replaceChildren(legend(), bars(this.#rows, this.#width), table(this.#rows), ...machines(this.#rows));
+    this.#holder.replaceChildren(legend(this.#rows), bars(this.#rows, this.#width), table(this.#rows), ...machines(this.#rows));
   }
 }
 
@@ -65,10 +65,11 @@ function postedRows(posted) {
   }));
 }
 
-function legend() {
+function legend(rows) {
   const key = (kind, text) =>
     element("span", {}, svg("svg", { width: 22, height: 12, "aria-hidden": "true" }, svg("rect", { class: kind, x: 1, y: 1, width: 20, height: 10 })), text);
-  return element("p", { className: "legend" }, key("bar p50", "p50"), key("bar p95", "p95"), key("bar live p50", "posted by players"));
+  const live = rows.some((row) => row.live) ? key("bar live p50", "posted by players") : "No player's client has posted what it sees.";
+  return element("p", { className: "legend" }, key("bar p50", "p50"), key("bar p95", "p95"), live);
 }
 
 function bars(rows, width) {

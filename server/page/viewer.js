@@ -44,6 +44,7 @@ export class Viewer {
         this.#pictures[index].alt = [left, right][index].name;
       });
       this.#size = [loaded[0].naturalWidth, loaded[0].naturalHeight];
+      this.#stage.style.aspectRatio = `${this.#size[0]} / ${this.#size[1]}`;
       this.#root.hidden = false;
       this.#place();
     } finally {
