@@ -29,6 +29,8 @@ const start = new StartForm(find("#start-form"), { onStarted: started, onProblem
 let sweep = null; // the one that is shown
 let figures = { points: [], latencies: [], posted: [], bdRates: { bd_rates: [] } };
 let refresh = 0; // the timer of the next reading
+let wantedSweep = 0; // answers come in any order: only the one to the newest question counts
+let wantedSavings = 0;
 
 async function showSweeps(wanted) {
   const { sweeps } = await get("sweeps");
@@ -43,9 +45,11 @@ async function showSweeps(wanted) {
 
 async function showSweep(id) {
   const path = `sweeps/${encodeURIComponent(id)}`;
+  const question = (wantedSweep += 1);
   const [found, { points }, { latencies }, { latencies: posted }, bdRates] = await Promise.all(
     [path, `${path}/points`, `${path}/latencies`, "client-latencies", `${path}/bd-rates`].map(get),
   );
+  if (question !== wantedSweep) return;
   const another = sweep?.id !== id;
   [sweep, figures] = [found, { points, latencies, posted, bdRates }];
   find("#sweep").value = id;
@@ -122,8 +126,9 @@ async function drawSavings(picked) {
   const metric = METRICS[picked.metric].graded ? picked.metric : "vmaf"; // of the others nobody has said what is good
   find("#target-metric").textContent = METRICS[metric].name;
   for (const button of find("#grades").children) button.setAttribute("aria-pressed", String(button.value === target.value));
+  const question = (wantedSavings += 1);
   const savings = await get(`sweeps/${encodeURIComponent(sweep.id)}/savings?metric=${metric}&target=${target.value}`);
-  find("#savings .tables").replaceChildren(...savingTables(savings, figures.bdRates, picked, lookOf()));
+  if (question === wantedSavings) find("#savings .tables").replaceChildren(...savingTables(savings, figures.bdRates, picked, lookOf()));
 }
 
 function sweepMoved(id, progress) {
