@@ -159,8 +159,9 @@ def _write(module: nn.Module, path: Path, state: State | None, divisor: int, met
         )
     assert program is not None
     model = program.model_proto
-    for node in model.graph.node:
-        del node.metadata_props[:]  # where in whose files each operator was traced: half a megabyte that says nothing to a client
+    graph = model.graph
+    for traced in (*graph.node, *graph.value_info, *graph.initializer, *graph.input, *graph.output):
+        del traced.metadata_props[:]  # where in whose files it was traced: half a megabyte that says nothing to a client
     for key, value in {"gamesr_format": FORMAT_VERSION, **metadata}.items():
         text = value if isinstance(value, str) else json.dumps(value)
         model.metadata_props.append(onnx.StringStringEntryProto(key=key, value=text))

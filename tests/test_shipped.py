@@ -41,6 +41,12 @@ def test_every_model_that_the_readme_names_ships() -> None:
     assert {path.stem for path in shipped_models()} == expected | {"gamesr-openarena_x2", "gamesr-supertuxkart_x2"}
 
 
+@pytest.mark.parametrize("path", shipped_models(), ids=lambda path: path.stem)
+def test_a_model_says_nothing_of_the_machine_that_made_it(path: Path) -> None:
+    content = path.read_bytes()
+    assert not any(word in content for word in (b"site-packages", b".py", b"/home", b"/root", b"/work", b"/tmp"))
+
+
 @pytest.mark.parametrize("path", TRAINED, ids=lambda path: path.stem)
 def test_a_trained_model_is_small_documented_and_beats_bicubic(path: Path, references: list[Frame]) -> None:
     assert path.stat().st_size < 1_000_000
