@@ -60,6 +60,7 @@ class SweepQueue:
 
     def __init__(self, database: Database, *, most: int, kept: int) -> None:
         self._database, self._most, self._kept = database, most, kept
+        self.path = database.path
 
     def add(self, request: SweepRequest) -> QueuedSweep:
         """Put a sweep at the end; raises QueueFullError."""

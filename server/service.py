@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from typing import Annotated, Any
 
@@ -42,11 +43,12 @@ class Service:
         self.players = Players(database, kept=limits.kept_client_latencies)
         self.stills = Stills(settings.frames, most=limits.frames_at_once, kept_bytes=limits.frames_kept_bytes)
         self.monitoring = Monitoring(settings, self.reader, self.queue)
+        self.building = asyncio.Lock()
         self.uploading = threading.BoundedSemaphore(limits.uploads_at_once)
         self.event_streams = threading.BoundedSemaphore(limits.events_at_once)
 
 
-def _of(request: Request) -> Service:
+async def _of(request: Request) -> Service:  # not async, it would be run in a thread
     service = request.app.state.service
     assert isinstance(service, Service)
     return service

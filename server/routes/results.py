@@ -7,6 +7,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, HTTPException, Query, Response
 from pydantic import BaseModel
+from starlette.concurrency import run_in_threadpool
 
 from server import answers
 from server.points import LatencyResult, PointResult
@@ -22,7 +23,7 @@ router = APIRouter(tags=["results"])
 
 
 @router.get("/sweeps/{sweep}/points", response_model=PointList, responses=problems(404))
-def read_points(
+async def read_points(
     sweep: SweepId,
     service: Shared,
     clip: Annotated[str | None, Query(min_length=1, max_length=MOST_NAME, description="only of this clip")] = None,
@@ -32,36 +33,36 @@ def read_points(
     def build(points: Sequence[PointResult], _: Sequence[LatencyResult]) -> BaseModel:
         return answers.point_list(sweep, [result for result in points if clip in (None, result.point.clip)])
 
-    return _answer(service, sweep, build, "points", clip)
+    return await _answer(service, sweep, build, "points", clip)
 
 
 @router.get("/sweeps/{sweep}/curves", response_model=CurveList, responses=problems(404))
-def read_curves(sweep: SweepId, service: Shared, metric: MetricName = "vmaf") -> Response:
+async def read_curves(sweep: SweepId, service: Shared, metric: MetricName = "vmaf") -> Response:
     """RD curves: quality over true bitrate, clip by clip."""
-    return _answer(service, sweep, lambda points, _: answers.curve_list(sweep, points, metric), "curves", metric)
+    return await _answer(service, sweep, lambda points, _: answers.curve_list(sweep, points, metric), "curves", metric)
 
 
 @router.get("/sweeps/{sweep}/bd-rates", response_model=BdRateList, responses=problems(404))
-def read_bd_rates(sweep: SweepId, service: Shared) -> Response:
+async def read_bd_rates(sweep: SweepId, service: Shared) -> Response:
     """Every curve against native resolution and against bicubic at its own height."""
-    return _answer(service, sweep, lambda points, _: answers.bd_rate_list(sweep, points), "bd-rates")
+    return await _answer(service, sweep, lambda points, _: answers.bd_rate_list(sweep, points), "bd-rates")
 
 
 @router.get("/sweeps/{sweep}/savings", response_model=SavingList, responses=problems(404))
-def read_savings(
+async def read_savings(
     sweep: SweepId,
     service: Shared,
     target: Annotated[float, Query(ge=0, le=100, allow_inf_nan=False, description="a quality in points of VMAF")] = 80.0,
     metric: TargetMetricName = "vmaf",
 ) -> Response:
     """The bitrate that reaches a quality, interpolated as BD-rate is and never extrapolated, and what that saves."""
-    return _answer(service, sweep, lambda points, _: answers.saving_list(sweep, points, metric, target), "savings", metric, target)
+    return await _answer(service, sweep, lambda points, _: answers.saving_list(sweep, points, metric, target), "savings", metric, target)
 
 
 @router.get("/sweeps/{sweep}/latencies", response_model=LatencyList, responses=problems(404))
-def read_latencies(sweep: SweepId, service: Shared) -> Response:
+async def read_latencies(sweep: SweepId, service: Shared) -> Response:
     """Milliseconds of every upscaler, stage by stage, and the share of frames that missed 30, 60 and 120 fps."""
-    return _answer(service, sweep, lambda _, latencies: answers.latency_list(latencies), "latencies")
+    return await _answer(service, sweep, lambda _, latencies: answers.latency_list(latencies), "latencies")
 
 
 @router.get("/latencies", tags=["results"], responses=problems())
@@ -72,8 +73,13 @@ def read_all_latencies(
     return answers.latency_list([result for result in service.reader.all_latencies() if upscaler in (None, result.upscaler)])
 
 
-def _answer(service: Service, sweep: str, build: Build, *about: object) -> Response:
-    content = service.sweeps.answer(sweep, build, *about)
+async def _answer(service: Service, sweep: str, build: Build, *about: object) -> Response:
+    content = service.sweeps.latest(sweep, *about)
+    if content is None:
+        async with service.building:  # of many who ask for the same at once, one builds it
+            content = service.sweeps.latest(sweep, *about)
+            if content is None:
+                content = await run_in_threadpool(service.sweeps.answer, sweep, build, *about)
     if content is None:
         raise HTTPException(404, f"there is no sweep {sweep}")
     return Response(content, media_type="application/json")
