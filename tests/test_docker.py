@@ -118,14 +118,15 @@ def test_the_containers_commands_come_up_healthy(tmp_path: Path) -> None:
         "/clips": str(ROOT / "tests/footage"),
         "/tmp": str(tmp_path),
         "0.0.0.0": "127.0.0.1",
-        "scheduler:8786": "127.0.0.1:8786",
+        "scheduler:8786": "127.0.0.1:28786",
     }
     ports = {port: str(int(port) + 20000) for port in ("8060", "8786", "8787", "8788")}
 
+    mapping = places | ports
+
     def here(word: str) -> str:
-        for there, place in (places | ports).items():
-            word = word.replace(there, place)
-        return word
+        # In one go: what a place is replaced by may hold the name of another.
+        return re.sub("|".join(map(re.escape, mapping)), lambda found: mapping[found[0]], word)
 
     with ExitStack() as stack:
         for name in LONG_RUNNING:
