@@ -117,12 +117,14 @@ class Store:
         return sqlite3.connect(self.path, timeout=_BUSY_S, isolation_level=None)
 
     def _open(self) -> None:
-        if self._version() not in (None, SCHEMA_VERSION):
+        self._connection.execute("BEGIN")  # one view of a file that another sweep may be creating
+        version = self._version()
+        self._connection.execute("COMMIT")
+        if version not in (None, SCHEMA_VERSION):
             raise OutputError(
-                f"{self.path} is a store of schema version {self._version()}, not {SCHEMA_VERSION} as this program's: "
-                "name another with --store"
+                f"{self.path} is a store of schema version {version}, not {SCHEMA_VERSION} as this program's: name another with --store"
             )
-        self._connection.execute("PRAGMA journal_mode = WAL")
+        self._write_ahead()
         self._connection.execute("PRAGMA synchronous = NORMAL")
         self._connection.execute("BEGIN IMMEDIATE")
         if self._version() is None:  # not while another sweep creates it
@@ -132,6 +134,18 @@ class Store:
             self._connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         self._connection.execute(_SWEEPS)
         self._connection.execute("COMMIT")
+
+    def _write_ahead(self) -> None:
+        """Put a new file into WAL mode, which SQLite refuses at once, without its usual wait, while another sweep does the same."""
+        deadline = time.monotonic() + _BUSY_S
+        while True:
+            try:
+                self._connection.execute("PRAGMA journal_mode = WAL")
+                return
+            except sqlite3.OperationalError as error:
+                if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() > deadline:
+                    raise
+            time.sleep(0.01)
 
     def _version(self) -> int | None:
         """None for a new file; raises OutputError for a database of someone else."""

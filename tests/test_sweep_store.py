@@ -5,8 +5,10 @@ from __future__ import annotations
 import multiprocessing
 import sqlite3
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from threading import Barrier
 
 import pytest
 
@@ -33,6 +35,19 @@ def test_what_is_kept_is_there_for_the_next_and_the_first_of_two_stays(tmp_path:
         with sqlite3.connect(tmp_path / "store") as connection:
             assert connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
             assert connection.execute("PRAGMA user_version").fetchone() == (SCHEMA_VERSION,)
+
+
+def test_all_of_many_sweeps_that_begin_at_once_open_one_new_store(tmp_path: Path) -> None:
+    together = Barrier(8)
+
+    def open_new(attempt: int) -> int | None:
+        together.wait()
+        with Store(tmp_path / f"store{attempt}") as store:
+            return store._version()
+
+    with ThreadPoolExecutor(together.parties) as sweeps:
+        for attempt in range(10):
+            assert set(sweeps.map(open_new, [attempt] * together.parties)) == {SCHEMA_VERSION}
 
 
 def test_a_claim_is_one_sweeps_until_it_is_given_back_or_its_sweep_is_gone(tmp_path: Path) -> None:
