@@ -20,8 +20,7 @@ from torch.nn import functional as F
 
 from model.fsr1 import SHARPNESS_STOPS, Fsr1
 from model.interpolation import Interpolation, chroma_shift
-from model.network import GameSR, Planes, State, parameter_count
-from model.reparam import fuse
+from model.network import GameSR, Planes, State, deployed, parameter_count
 
 FORMAT_VERSION = "1"
 OPSET = 20  # the first with Gelu as one operator: 15% of a frame's time on a CPU
@@ -73,8 +72,7 @@ class Frontend(nn.Module):
 
     def forward(self, y: Tensor, u: Tensor, v: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
         frame = Planes(*(p.to(self.network.stem.weight.dtype) for p in (y, u, v)))
-        picture, after = self.network.step(frame, State(*state) if state else None)
-        planes = tuple(to_codes(p) for p in picture)
+        planes, after = self.network.step(frame, State(*state) if state else None, to_codes)
         if after is None:
             return planes
         return (*planes, *after, after.h.sum() + after.c.sum())
@@ -86,8 +84,7 @@ def export_network(network: GameSR, path: Path, *, name: str, card: dict[str, An
     `network` itself is left as it is.
     """
     config = network.config
-    fused = fuse(copy.deepcopy(network).float().eval())
-    assert isinstance(fused, GameSR)
+    fused = deployed(copy.deepcopy(network).float().eval())
     state = [] if fused.lstm is None else [state_entry(part, config.channels, config.unshuffle) for part in State._fields]
     card = {**card, "network": asdict(config), "parameters": parameter_count(fused), "parameters_in_training": parameter_count(network)}
     metadata = {

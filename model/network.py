@@ -6,6 +6,7 @@ blocks between the decoder's own Y, U and V planes, without any colour conversio
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -15,7 +16,7 @@ from torch.nn import functional as F
 
 from model.colour import PlanesToRgb, RgbToPlanes
 from model.interpolation import Interpolation, LearnedInterpolation, chroma_shift
-from model.reparam import LinearTriple
+from model.reparam import LinearTriple, fuse
 
 
 class Planes(NamedTuple):
@@ -46,7 +47,8 @@ class NetworkConfig:
 
     `unshuffle` is PixelUnshuffle's factor (1: none); an input's height and width are multiples of `size_multiple`.
     `learned_base` lets training bend the bicubic kernel under the residual, and `skip` adds the ConvLSTM's input to its
-    output, so that detail need not pass through gates that saturate; both are ours, not the paper's.
+    output, so that detail need not pass through gates that saturate; both are ours, not the paper's. `lean` has ReLU for
+    GELU and no LayerNorm, which take longer than the convolutions where those run in bfloat16 or int8.
     """
 
     scale: Literal[2, 3] = 2
@@ -58,6 +60,7 @@ class NetworkConfig:
     recurrent: bool = True
     learned_base: bool = False
     skip: bool = False
+    lean: bool = False
 
     def __post_init__(self) -> None:
         if self.colour == "planes" and self.unshuffle % 2:
@@ -72,6 +75,7 @@ PRESETS: dict[str, dict[str, object]] = {
     "planes": {"learned_base": True, "skip": True},
     "planes-no-lstm": {"learned_base": True, "recurrent": False},
     "planes-plain": {},
+    "live": {"learned_base": True, "recurrent": False, "lean": True, "unshuffle": 4, "channels": 48, "expanded": 96, "blocks": 4},
     "paper": {"colour": "rgb"},
     "paper-no-lstm": {"colour": "rgb", "recurrent": False},
     "paper-no-unshuffle": {"colour": "rgb", "unshuffle": 1},
@@ -84,14 +88,19 @@ RESIDUAL_GAIN = 0.1
 
 
 class FeatureBlock(nn.Module):
-    """FEB: a linear triple, GELU, residual, LayerNorm over channels (section 3.2; the order is that of section A.2)."""
+    """FEB: a linear triple, GELU, residual, LayerNorm over channels (section 3.2; the order is that of section A.2).
 
-    def __init__(self, channels: int, expanded: int) -> None:
+    A lean one: a linear triple, ReLU, residual.
+    """
+
+    def __init__(self, channels: int, expanded: int, *, lean: bool = False) -> None:
         super().__init__()
         self.conv: nn.Module = LinearTriple(channels, expanded)
-        self.norm = nn.LayerNorm(channels)
+        self.norm = None if lean else nn.LayerNorm(channels)
 
     def forward(self, x: Tensor) -> Tensor:
+        if self.norm is None:
+            return x + F.relu(self.conv(x))
         x = x + F.gelu(self.conv(x))
         out: Tensor = self.norm(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
         return out
@@ -113,6 +122,22 @@ class ConvLstm(nn.Module):
         return State(torch.sigmoid(o) * torch.tanh(c), c)
 
 
+class MergedHead(nn.Module):
+    """A head and the interpolation under it as one convolution, of features and of the planes' own cells.
+
+    Takes features (N, C, h, w) and the cells of edge-replicated planes (N, S, h + 2, w + 2) of 2 * code - 255, which bfloat16
+    holds exactly; gives the cells of the picture in code values.
+    """
+
+    def __init__(self, features: int, cells: int, outputs: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(features + cells, outputs, 3)
+
+    def forward(self, features: Tensor, cells: Tensor) -> Tensor:
+        out: Tensor = self.conv(torch.cat((F.pad(features, (1, 1, 1, 1)), cells), 1))
+        return out
+
+
 class GameSR(nn.Module):
     """The network of a `NetworkConfig`: `step` takes a frame and a state, `forward` a clip; both are the same graph.
 
@@ -127,18 +152,17 @@ class GameSR(nn.Module):
         side = s * r
         if config.colour == "planes":
             inputs, outputs = s * s + 2 * (s // 2) ** 2, side**2 + 2 * (side // 2) ** 2
-            base = LearnedInterpolation if config.learned_base else Interpolation
-            self.luma_base = base("bicubic", r, s)
-            self.chroma_base = base("bicubic", r, s // 2, chroma_shift(r))
+            self.luma_base = self._base(s, 0.0)
+            self.chroma_base = self._base(s // 2, chroma_shift(r))
         else:
             inputs, outputs = 3 * s * s, 3 * side**2
             self.to_rgb, self.to_planes = PlanesToRgb(), RgbToPlanes()
             self.rgb_base = Interpolation("bicubic", r, s)
             self.tail = nn.Conv2d(3, 3, 3, padding=1)
         self.stem = nn.Conv2d(inputs, c, 3, padding=1)
-        self.blocks = nn.ModuleList(FeatureBlock(c, config.expanded) for _ in range(config.blocks))
+        self.blocks = nn.ModuleList(FeatureBlock(c, config.expanded, lean=config.lean) for _ in range(config.blocks))
         self.lstm = ConvLstm(c) if config.recurrent else None
-        self.head = nn.Conv2d(c, outputs, 3, padding=1)
+        self.head: nn.Conv2d | MergedHead = nn.Conv2d(c, outputs, 3, padding=1)
         last = self.head if config.colour == "planes" else self.tail
         nn.init.zeros_(last.weight)
         assert last.bias is not None
@@ -152,22 +176,27 @@ class GameSR(nn.Module):
         zeros = self.stem.weight.new_zeros(batch, self.config.channels, height // s, width // s)
         return State(zeros, torch.zeros_like(zeros))  # two tensors: an exporter takes one given twice for one input
 
-    def step(self, frame: Planes, state: State | None) -> tuple[Planes, State | None]:
-        """One frame, planes (N, 1, H, W) and (N, 1, H/2, W/2), and the state after it."""
-        rgb = None if self.config.colour == "planes" else self.to_rgb(*frame)
-        features = self._features(frame, rgb)
+    def step(
+        self, frame: Planes, state: State | None, finish: Callable[[Tensor], Tensor] = lambda samples: samples
+    ) -> tuple[Planes, State | None]:
+        """One frame, planes (N, 1, H, W) and (N, 1, H/2, W/2), and the state after it.
+
+        `finish` is applied to every sample of the picture where that costs least: before PixelShuffle moves them, if it can.
+        """
+        source = self._source(frame)
+        features = self._features(source)
         if self.lstm is not None:
             assert state is not None
             state = self.lstm(features, state)
             features = state.h + features if self.config.skip else state.h
-        return self._picture(frame, rgb, features), state
+        return self._picture(frame, source, features, finish), state
 
     def forward(self, clip: Planes, state: State | None = None) -> tuple[Planes, State | None]:
         """A clip, planes (N, T, 1, H, W) and (N, T, 1, H/2, W/2): `step` over T, the parts without memory batched."""
         batch, steps, _, height, width = clip.y.shape
         frames = clip.flatten_time()
-        rgb = None if self.config.colour == "planes" else self.to_rgb(*frames)
-        features = self._features(frames, rgb)
+        source = self._source(frames)
+        features = self._features(source)
         if self.lstm is not None:
             state = state or self.initial_state(batch, height, width)
             assert state is not None
@@ -177,34 +206,90 @@ class GameSR(nn.Module):
                 hidden.append(state.h)
             remembered = torch.stack(hidden, 1).flatten(0, 1)
             features = remembered + features if self.config.skip else remembered
-        return self._picture(frames, rgb, features).unflatten_time(batch), state
+        return self._picture(frames, source, features, lambda samples: samples).unflatten_time(batch), state
 
-    def _features(self, frame: Planes, rgb: Tensor | None) -> Tensor:
+    def merge_base(self) -> None:
+        """Make the head and the base under it one convolution, in place; only of a fused network whose base reaches one cell."""
+        assert isinstance(self.head, nn.Conv2d) and self.head.bias is not None
+        bases = [base.kernel().double() for base in (self.luma_base, self.chroma_base, self.chroma_base)]
+        merged = MergedHead(self.config.channels, self.stem.in_channels, self.head.out_channels).to(self.head.weight)
+        assert merged.conv.bias is not None
+        with torch.no_grad():
+            # codes are (x + 255) / 2 of what goes in, and every kernel of the base sums to one
+            merged.conv.weight.copy_(
+                torch.cat((255 * RESIDUAL_GAIN * self.head.weight.double(), 0.5 * block_diagonal(bases).to(self.head.weight.device)), 1)
+            )
+            merged.conv.bias.copy_(255 * RESIDUAL_GAIN * self.head.bias.double() + 127.5)
+            self.stem.weight.mul_(INPUT_GAIN / 510)
+        self.head = merged
+        del self.luma_base, self.chroma_base
+
+    def _base(self, block: int, shift: float) -> Interpolation:
+        scale = self.config.scale
+        if not self.config.learned_base:
+            return Interpolation("bicubic", scale, block, shift)
+        return LearnedInterpolation("bicubic", scale, block, shift, reach=max(1, 4 // self.config.unshuffle))
+
+    def _source(self, frame: Planes) -> Tensor:
+        """What the layers see: the planes' cells around zero, with one more around them for a merged head, or RGB."""
+        if self.config.colour == "rgb":
+            rgb: Tensor = self.to_rgb(*frame)
+            return rgb
         s = self.config.unshuffle
-        if rgb is None:
-            x = torch.cat([F.pixel_unshuffle(p, b) for p, b in zip(frame, (s, s // 2, s // 2), strict=True)], 1)
-            x = x / 255 - 0.5
+        blocks = (s, s // 2, s // 2)
+        if isinstance(self.head, MergedHead):
+            frame = Planes(*(F.pad(plane, (b, b, b, b), mode="replicate") for plane, b in zip(frame, blocks, strict=True)))
+        cells = torch.cat([F.pixel_unshuffle(plane, b) for plane, b in zip(frame, blocks, strict=True)], 1)
+        return 2 * cells - 255 if isinstance(self.head, MergedHead) else cells / 255 - 0.5
+
+    def _features(self, source: Tensor) -> Tensor:
+        if isinstance(self.head, MergedHead):
+            x = self.stem(source[:, :, 1:-1, 1:-1])
+        elif self.config.colour == "rgb":
+            x = self.stem(INPUT_GAIN * F.pixel_unshuffle(source - 0.5, self.config.unshuffle))
         else:
-            x = F.pixel_unshuffle(rgb - 0.5, s)
-        x = F.relu(self.stem(INPUT_GAIN * x))
-        total = x
+            x = self.stem(INPUT_GAIN * source)
+        total = x = F.relu(x)
         for block in self.blocks:
             x = block(x)
-            total = total + x
+            total = x if self.config.lean else total + x
         return total
 
-    def _picture(self, frame: Planes, rgb: Tensor | None, features: Tensor) -> Planes:
+    def _picture(self, frame: Planes, source: Tensor, features: Tensor, finish: Callable[[Tensor], Tensor]) -> Planes:
         side = self.config.unshuffle * self.config.scale
-        if rgb is None:
-            n, m = side**2, (side // 2) ** 2
+        if self.config.colour == "rgb":
+            residual = self.tail(F.pixel_shuffle(F.relu(self.head(features)), side))
+            channels = source.flatten(0, 1).unsqueeze(1)
+            base = F.pixel_shuffle(self.rgb_base(channels), side).reshape(residual.shape)
+            return Planes(*(finish(p) for p in self.to_planes(base + RESIDUAL_GAIN * residual.to(base.dtype))))
+        if isinstance(self.head, MergedHead):
+            cells = self.head(features, source)
+        else:
             base = torch.cat((self.luma_base(frame.y), self.chroma_base(frame.u), self.chroma_base(frame.v)), 1)
             # cells of bicubic code values plus the head's residual, still one pixel a channel
-            y, u, v = (base + 255 * RESIDUAL_GAIN * self.head(features).to(base.dtype)).split((n, m, m), 1)
-            return Planes(F.pixel_shuffle(y, side), F.pixel_shuffle(u, side // 2), F.pixel_shuffle(v, side // 2))
-        residual = self.tail(F.pixel_shuffle(F.relu(self.head(features)), side))
-        channels = rgb.flatten(0, 1).unsqueeze(1)
-        base = F.pixel_shuffle(self.rgb_base(channels), side).reshape(residual.shape)
-        return Planes(*self.to_planes(base + RESIDUAL_GAIN * residual.to(base.dtype)))
+            cells = base + 255 * RESIDUAL_GAIN * self.head(features).to(base.dtype)
+        n, m = side**2, (side // 2) ** 2
+        y, u, v = torch.split(finish(cells), [n, m, m], 1)
+        return Planes(F.pixel_shuffle(y, side), F.pixel_shuffle(u, side // 2), F.pixel_shuffle(v, side // 2))
+
+
+def block_diagonal(kernels: list[Tensor]) -> Tensor:
+    """Kernels (O, I, h, w) of convolutions beside each other as that of one, zero between them."""
+    inputs, outputs = sum(k.shape[1] for k in kernels), sum(k.shape[0] for k in kernels)
+    whole = kernels[0].new_zeros(outputs, inputs, *kernels[0].shape[2:])
+    row = column = 0
+    for kernel in kernels:
+        whole[row : row + kernel.shape[0], column : column + kernel.shape[1]] = kernel
+        row, column = row + kernel.shape[0], column + kernel.shape[1]
+    return whole
+
+
+def deployed(network: GameSR) -> GameSR:
+    """The network in the form that runs, in place: triples as one convolution, and the base in the head where it reaches one cell."""
+    fuse(network)
+    if network.config.colour == "planes" and network.config.unshuffle >= 4:
+        network.merge_base()
+    return network
 
 
 def parameter_count(network: nn.Module) -> int:

@@ -17,8 +17,7 @@ from client.artifact import load_session
 from client.errors import InputError, ModelError
 from client.frames import Frame
 from model.export import to_codes
-from model.network import GameSR, NetworkConfig, Planes, State
-from model.reparam import fuse
+from model.network import GameSR, NetworkConfig, Planes, State, deployed
 
 
 @dataclass(frozen=True)
@@ -37,11 +36,10 @@ def network_of_artifact(artifact: Path) -> GameSR:
     _, spec = load_session(artifact, "cpu", 1)
     if "network" not in spec.card:
         raise ModelError(f"{artifact} is no network: only a trained artifact has weights to verify")
-    network = fuse(GameSR(NetworkConfig(**spec.card["network"])))
+    network = deployed(GameSR(NetworkConfig(**spec.card["network"])))
     weights = {
         t.name.removeprefix("network."): torch.from_numpy(numpy_helper.to_array(t).copy()) for t in onnx.load(artifact).graph.initializer
     }
-    assert isinstance(network, GameSR)
     missing = network.state_dict().keys() - weights.keys()
     if missing:
         raise ModelError(f"{artifact} lacks the weights {', '.join(sorted(missing))}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from model.network import PRESETS, GameSR, NetworkConfig, Planes, State, parameter_count
+from model.network import PRESETS, GameSR, MergedHead, NetworkConfig, Planes, State, deployed, parameter_count
 from model.reparam import fuse
 from tests.networks import random_clip, random_network
 
@@ -20,6 +20,7 @@ from tests.networks import random_clip, random_network
         ("planes-plain", 2, 288_472, 129_112),
         ("planes", 2, 288_472 + 1_700, 129_112 + 1_700),  # and the learned kernels under the residual
         ("planes", 3, 297_142 + 3_825, 137_782 + 3_825),
+        ("live", 2, 431_376, 144_912),
     ],
 )
 def test_parameter_counts(preset: str, scale: int, training: int, fused: int) -> None:
@@ -74,6 +75,19 @@ def test_an_untrained_network_is_bicubic(preset: str) -> None:
     interpolate = torch.nn.functional.interpolate
     expected = interpolate(clip.y[:, 0], scale_factor=2, mode="bicubic", align_corners=False)
     torch.testing.assert_close(picture.y[:, 0], expected, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("preset", ["live", "planes"])
+@pytest.mark.parametrize("scale", [2, 3])
+def test_the_form_that_runs_gives_the_same_picture_to_the_border(preset: str, scale: int) -> None:
+    network = random_network(preset, scale).double()
+    clip = random_clip(1, 2, 16, 24)
+    before, _ = network(clip)
+    running = deployed(network)
+    assert isinstance(running.head, MergedHead) == (preset == "live")
+    after, _ = running(clip)
+    for expected, found in zip(before, after, strict=True):
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
 
 
 def test_a_planes_network_needs_an_even_unshuffle() -> None:
