@@ -101,7 +101,7 @@ def export_main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="gamesr-export",
         description="Write a trained network, or a baseline, as a self-describing ONNX artifact, its model card beside it.",
-        epilog="examples:\n  gamesr-export runs/openarena_x2/checkpoint.pt gamesr-openarena\n  gamesr-export bicubic bicubic",
+        epilog="examples:\n  gamesr-export runs/mine_x2/checkpoint.pt mine\n  gamesr-export bicubic bicubic",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("weights", help=f"a run's checkpoint.pt; or {', '.join(BASELINES)}, for both scales")

@@ -177,7 +177,7 @@ def test_models_come_with_their_cards(measured: tuple[httpx.Client, str]) -> Non
     assert [f"{model['name']}_x{model['scale']}" for model in models] == [path.stem for path in shipped_models()]
     gamesr = read(client, "/api/v1/models/gamesr", scale=3)
     assert gamesr in models and gamesr["recurrent"] and gamesr["card_markdown"].startswith("# gamesr x3") and gamesr["card"]
-    assert client.get("/api/v1/models/gamesr-openarena", params={"scale": 3}).status_code == 404
+    assert client.get("/api/v1/models/sharpest", params={"scale": 3}).status_code == 404
 
 
 def test_health_readiness_and_figures_for_prometheus(measured: tuple[httpx.Client, str], tmp_path: Path) -> None:

@@ -135,18 +135,18 @@ def test_what_cannot_be_swept_is_refused_while_the_caller_listens(folder: Path) 
 
 def test_a_sweep_that_fails_says_why_without_the_services_paths(folder: Path) -> None:
     with serving(of(folder)) as client:
-        odd, gone = start(client, upscalers=["gamesr-openarena"], low_heights=[24]), start(client)
+        odd, gone = start(client, upscalers=["bicubic"], low_heights=[72]), start(client)
         (folder / "clips/clip.mkv").rename(folder / "clips/other.mkv")
         late = start_of(client, "other.mkv")
         with RunnerProcess(of(folder)):
             until(lambda: state(client, late) == "done")
         reasons = {sweep: client.get(f"/api/v1/sweeps/{sweep}").json()["progress"]["reason"] for sweep in (odd, gone)}
         assert "is not there any more" in reasons[odd] and "is not there any more" in reasons[gone]
-        unfit = start_of(client, "other.mkv", upscalers=["gamesr-openarena"], low_heights=[24])
+        unfit = start_of(client, "other.mkv", upscalers=["bicubic"], low_heights=[72])
         with RunnerProcess(of(folder)):
             until(lambda: state(client, unfit) == "failed")
         reason = client.get(f"/api/v1/sweeps/{unfit}").json()["progress"]["reason"]
-        assert "gamesr-openarena needs a height that is a half" in reason and str(folder) not in reason
+        assert "bicubic needs a height that is a half or a third" in reason and str(folder) not in reason
 
 
 def start_of(client: httpx.Client, clip: str, **more: Any) -> str:

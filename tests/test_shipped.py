@@ -38,7 +38,7 @@ def psnr_y_db(path: Path, references: list[Frame]) -> float:
 
 def test_every_model_that_the_readme_names_ships() -> None:
     expected = {f"{name}_x{scale}" for name in ("bicubic", "lanczos", "easu", "fsr1", "gamesr", "gamesr-paper") for scale in (2, 3)}
-    assert {path.stem for path in shipped_models()} == expected | {"gamesr-openarena_x2", "gamesr-supertuxkart_x2"}
+    assert {path.stem for path in shipped_models()} == expected
 
 
 @pytest.mark.parametrize("path", shipped_models(), ids=lambda path: path.stem)

@@ -91,7 +91,7 @@ def test_bad_input_is_one_sentence_before_any_work(
         ((clip, "--upscalers", "none,sharpest"), "no model named 'sharpest'"),
         ((clip, "--upscalers", tmp_path / "none.onnx"), "cannot be read"),
         ((clip, "--upscalers", f"bicubic,{bicubic}"), "asked for twice"),
-        ((clip, "--upscalers", "none,gamesr-openarena", "--heights", "24"), "gamesr-openarena needs a height that is a half of a clip's"),
+        ((clip, "--upscalers", f"none,{bicubic}", "--heights", "24"), "bicubic needs a height that is a half of a clip's"),
         ((clip, "--upscalers", "bicubic", "--heights", "72"), "bicubic needs a height that is a half or a third"),
         ((clip, "--fps", "20"), "no whole part"),
         ((clip, "--render", clip, wide), "which is neither half nor a third"),
