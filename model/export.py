@@ -25,6 +25,7 @@ from model.network import GameSR, Planes, State, deployed, parameter_count
 FORMAT_VERSION = "1"
 OPSET = 20  # the first with Gelu as one operator: 15% of a frame's time on a CPU
 FSR1_PASSES = {"easu": "EASU", "fsr1": f"EASU, then RCAS at {SHARPNESS_STOPS} stops"}
+TRACED = (24, 32)  # the size at which a graph is traced, of any height and width afterwards
 BASELINES = ("bicubic", "lanczos", *FSR1_PASSES)
 
 
@@ -95,7 +96,7 @@ def export_network(network: GameSR, path: Path, *, name: str, card: dict[str, An
         "state": state,
         "card": card,
     }
-    _write(Frontend(fused), path, fused.initial_state(1, 2 * 12, 2 * 16), config.unshuffle, metadata)
+    _write(Frontend(fused), path, fused.initial_state(1, *TRACED), config.unshuffle, metadata)
     return card
 
 
@@ -134,11 +135,12 @@ def _quiet_exporter() -> Iterator[None]:
 
 
 def _write(module: nn.Module, path: Path, state: State | None, divisor: int, metadata: dict[str, Any]) -> None:
-    chroma = torch.zeros(1, 1, 12, 16, dtype=torch.uint8)
-    luma = torch.zeros(1, 1, 24, 32, dtype=torch.uint8)
-    h2, w2 = torch.export.Dim("half_height", min=1), torch.export.Dim("half_width", min=1)
-    shapes: list[Any] = [{2: 2 * h2, 3: 2 * w2}, {2: h2, 3: w2}, {2: h2, 3: w2}]
-    cells = {2: h2, 3: w2} if divisor == 2 else {2: 2 * h2, 3: 2 * w2}
+    chroma = torch.zeros(1, 1, TRACED[0] // 2, TRACED[1] // 2, dtype=torch.uint8)
+    luma = torch.zeros(1, 1, *TRACED, dtype=torch.uint8)
+    rows, columns = torch.export.Dim("rows", min=1), torch.export.Dim("columns", min=1)
+    multiple = metadata["size_multiple"]
+    shapes: list[Any] = [{2: multiple // d * rows, 3: multiple // d * columns} for d in (1, 2, 2)]
+    cells = {2: multiple // divisor * rows, 3: multiple // divisor * columns}
     parts = [] if state is None else list(State._fields)
     with _quiet_exporter():
         program = torch.onnx.export(

@@ -71,11 +71,13 @@ class NetworkConfig:
         return max(2, self.unshuffle)
 
 
+LEAN: dict[str, object] = {"learned_base": True, "lean": True, "unshuffle": 4, "channels": 48, "expanded": 96, "blocks": 4}
 PRESETS: dict[str, dict[str, object]] = {
     "planes": {"learned_base": True, "skip": True},
     "planes-no-lstm": {"learned_base": True, "recurrent": False},
     "planes-plain": {},
-    "live": {"learned_base": True, "recurrent": False, "lean": True, "unshuffle": 4, "channels": 48, "expanded": 96, "blocks": 4},
+    "live": {**LEAN, "recurrent": False},
+    "balanced": {**LEAN, "skip": True},
     "paper": {"colour": "rgb"},
     "paper-no-lstm": {"colour": "rgb", "recurrent": False},
     "paper-no-unshuffle": {"colour": "rgb", "unshuffle": 1},

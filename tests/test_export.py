@@ -26,19 +26,19 @@ def frames(height: int, width: int, count: int = 8) -> list[Frame]:
 def artifacts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("artifacts")
     paths = {}
-    for preset, scale in (("paper", 2), ("planes", 2), ("planes", 3), ("planes-no-lstm", 2)):
+    for preset, scale in (("paper", 2), ("planes", 2), ("planes", 3), ("planes-no-lstm", 2), ("balanced", 2), ("live", 3)):
         paths[f"{preset}_x{scale}"] = folder / f"{preset}_x{scale}.onnx"
         export_network(random_network(preset, scale), paths[f"{preset}_x{scale}"], name=preset, card={"steps": 0})
     return paths
 
 
-@pytest.mark.parametrize("name", ["paper_x2", "planes_x2", "planes_x3", "planes-no-lstm_x2"])
+@pytest.mark.parametrize("name", ["paper_x2", "planes_x2", "planes_x3", "planes-no-lstm_x2", "balanced_x2", "live_x3"])
 def test_artifact_equals_float64_over_recurrent_steps(artifacts: dict[str, Path], name: str) -> None:
     errors = list(parity(artifacts[name], frames(24, 40), 40))
     assert len(errors) == 40
     assert max(e.max_code_error for e in errors) <= 1
     assert max(e.differing_pixels for e in errors) < 1e-3
-    assert max(e.max_state_error for e in errors[20:]) < 1e-4
+    assert max(e.max_state_error for e in errors[20:]) < (5e-4 if name.startswith("balanced") else 1e-4)  # no norm holds its features
 
 
 def test_parity_notices_a_wrong_weight(artifacts: dict[str, Path], tmp_path: Path) -> None:
@@ -62,9 +62,10 @@ def test_the_artifact_says_what_it_is(artifacts: dict[str, Path]) -> None:
     assert OnnxUpscaler(artifacts["planes-no-lstm_x2"], threads=1).spec.state == ()
 
 
+@pytest.mark.parametrize("name", ["planes_x2", "balanced_x2"])
 @pytest.mark.parametrize("size", [(2, 2), (4, 2), (34, 46), (90, 160)])
-def test_any_size_goes_through_one_artifact(artifacts: dict[str, Path], size: tuple[int, int]) -> None:
-    upscaler = OnnxUpscaler(artifacts["planes_x2"], threads=1)
+def test_any_size_goes_through_one_artifact(artifacts: dict[str, Path], size: tuple[int, int], name: str) -> None:
+    upscaler = OnnxUpscaler(artifacts[name], threads=1)
     picture, _ = upscaler.step(frames(*size, count=1)[0], upscaler.initial_state(*size))
     assert (picture.height, picture.width) == (2 * size[0], 2 * size[1])
 

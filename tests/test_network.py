@@ -21,6 +21,7 @@ from tests.networks import random_clip, random_network
         ("planes", 2, 288_472 + 1_700, 129_112 + 1_700),  # and the learned kernels under the residual
         ("planes", 3, 297_142 + 3_825, 137_782 + 3_825),
         ("live", 2, 431_376, 144_912),
+        ("balanced", 2, 431_376 + 166_080, 144_912 + 166_080),
     ],
 )
 def test_parameter_counts(preset: str, scale: int, training: int, fused: int) -> None:
@@ -77,14 +78,14 @@ def test_an_untrained_network_is_bicubic(preset: str) -> None:
     torch.testing.assert_close(picture.y[:, 0], expected, rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize("preset", ["live", "planes"])
+@pytest.mark.parametrize("preset", ["live", "balanced", "planes"])
 @pytest.mark.parametrize("scale", [2, 3])
 def test_the_form_that_runs_gives_the_same_picture_to_the_border(preset: str, scale: int) -> None:
     network = random_network(preset, scale).double()
     clip = random_clip(1, 2, 16, 24)
     before, _ = network(clip)
     running = deployed(network)
-    assert isinstance(running.head, MergedHead) == (preset == "live")
+    assert isinstance(running.head, MergedHead) == (preset != "planes")
     after, _ = running(clip)
     for expected, found in zip(before, after, strict=True):
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
