@@ -16,6 +16,7 @@ from client.errors import ModelError, ProviderError
 FORMAT = "1"
 MAX_FILE_BYTES = 64 * 2**20
 MAX_STATE_CHANNELS = 4096
+MAX_REACH = 2048
 PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider", "openvino": "OpenVINOExecutionProvider"}
 _TENSOR_TYPES = {"float32": "tensor(float)", "float16": "tensor(float16)"}
 
@@ -33,15 +34,24 @@ class StateSpec:
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """What the exporter wrote into the artifact; `sha256` is of the file, `card` holds free facts of the training."""
+    """What the exporter wrote into the artifact; `sha256` is of the file, `card` holds free facts of the training.
+
+    `reach` is how many luma pixels of the input, a multiple of `size_multiple`, the picture and the next state of an area can
+    depend on beyond that area; None where the artifact does not say.
+    """
 
     name: str
     scale: int
     size_multiple: int
     precision: str
     state: tuple[StateSpec, ...]
+    reach: int | None
     sha256: str
     card: dict[str, Any] = field(hash=False)
+
+    def padded(self, size: int) -> int:
+        """The multiple of `size_multiple` that a height or a width is padded to."""
+        return -(-size // self.size_multiple) * self.size_multiple
 
 
 def load_session(model: Path, provider: str, threads: int) -> tuple[ort.InferenceSession, ModelSpec]:
@@ -115,6 +125,7 @@ def _read_spec(metadata: dict[str, str], sha256: str) -> ModelSpec:
             size_multiple=int(metadata["size_multiple"]),
             precision=metadata["precision"],
             state=tuple(StateSpec(**entry) for entry in json.loads(metadata["state"])),
+            reach=int(metadata["reach"]) if "reach" in metadata else None,
             sha256=sha256,
             card=dict(json.loads(metadata["card"])),
         )
@@ -126,6 +137,8 @@ def _read_spec(metadata: dict[str, str], sha256: str) -> ModelSpec:
         raise _NotUnderstood(f"its scale is {spec.scale}, not 2 or 3")
     if not 2 <= spec.size_multiple <= 64 or spec.size_multiple % 2:
         raise _NotUnderstood(f"its size multiple is {spec.size_multiple}, not an even number up to 64")
+    if spec.reach is not None and (not 0 <= spec.reach <= MAX_REACH or spec.reach % spec.size_multiple):
+        raise _NotUnderstood(f"its reach is {spec.reach}, not a multiple of {spec.size_multiple} up to {MAX_REACH}")
     for state in spec.state:
         if state.dtype not in _TENSOR_TYPES:
             raise _NotUnderstood(f"its state {state.input} is {state.dtype}")

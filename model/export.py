@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -21,6 +21,7 @@ from torch.nn import functional as F
 from model.fsr1 import SHARPNESS_STOPS, Fsr1
 from model.interpolation import Interpolation, chroma_shift
 from model.network import GameSR, Planes, State, deployed, parameter_count
+from model.reach import network_reach, reach
 
 FORMAT_VERSION = "1"
 OPSET = 20  # the first with Gelu as one operator: 15% of a frame's time on a CPU
@@ -47,9 +48,12 @@ class Baseline(nn.Module):
         self.side = scale
 
     def forward(self, y: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        luma = F.pixel_shuffle(to_codes(self.luma(y.float())), 2 * self.side)
-        chroma = F.pixel_shuffle(to_codes(self.chroma(torch.cat((u, v)).float())), self.side)
-        return luma, chroma[:1], chroma[1:]
+        return self.samples(Planes(y.float(), u.float(), v.float()), to_codes)
+
+    def samples(self, frame: Planes, finish: Callable[[Tensor], Tensor] = lambda samples: samples) -> Planes:
+        luma = F.pixel_shuffle(finish(self.luma(frame.y)), 2 * self.side)
+        chroma = F.pixel_shuffle(finish(self.chroma(torch.cat((frame.u, frame.v)))), self.side)
+        return Planes(luma, chroma[:1], chroma[1:])
 
 
 class Fsr1Baseline(nn.Module):
@@ -60,8 +64,11 @@ class Fsr1Baseline(nn.Module):
         self.fsr1 = Fsr1(scale, sharpen=sharpen)
 
     def forward(self, y: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        y, u, v = self.fsr1(y.float(), u.float(), v.float())
+        y, u, v = self.samples(Planes(y.float(), u.float(), v.float()))
         return to_codes(y), to_codes(u), to_codes(v)
+
+    def samples(self, frame: Planes) -> Planes:
+        return Planes(*self.fsr1(*frame))
 
 
 class Frontend(nn.Module):
@@ -94,6 +101,7 @@ def export_network(network: GameSR, path: Path, *, name: str, card: dict[str, An
         "size_multiple": config.size_multiple,
         "precision": "float32",
         "state": state,
+        "reach": network_reach(copy.deepcopy(fused).double()),
         "card": card,
     }
     _write(Frontend(fused), path, fused.initial_state(1, *TRACED), config.unshuffle, metadata)
@@ -102,7 +110,7 @@ def export_network(network: GameSR, path: Path, *, name: str, card: dict[str, An
 
 def export_baseline(name: str, scale: int, path: Path) -> None:
     """Write one of BASELINES; its card says what it computes."""
-    module: nn.Module
+    module: Baseline | Fsr1Baseline
     if name in FSR1_PASSES:
         module = Fsr1Baseline(scale, sharpen=name == "fsr1")
         card = {
@@ -112,7 +120,8 @@ def export_baseline(name: str, scale: int, path: Path) -> None:
     else:
         module = Baseline(name, scale)
         card = {"interpolation": name}
-    metadata = {"name": name, "scale": scale, "size_multiple": 2, "precision": "float32", "state": [], "card": card}
+    far = reach(module.double().samples, 2)
+    metadata = {"name": name, "scale": scale, "size_multiple": 2, "precision": "float32", "state": [], "reach": far, "card": card}
     _write(module.float(), path, None, 1, metadata)
 
 
@@ -162,6 +171,8 @@ def _write(module: nn.Module, path: Path, state: State | None, divisor: int, met
     for traced in (*graph.node, *graph.value_info, *graph.initializer, *graph.input, *graph.output):
         del traced.metadata_props[:]  # where in whose files it was traced: half a megabyte that says nothing to a client
     for key, value in {"gamesr_format": FORMAT_VERSION, **metadata}.items():
+        if value is None:
+            continue
         text = value if isinstance(value, str) else json.dumps(value)
         model.metadata_props.append(onnx.StringStringEntryProto(key=key, value=text))
     onnx.checker.check_model(model, full_check=True)
