@@ -17,7 +17,7 @@ FORMAT = "1"
 MAX_FILE_BYTES = 64 * 2**20
 MAX_STATE_CHANNELS = 4096
 MAX_REACH = 2048
-PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider", "openvino": "OpenVINOExecutionProvider"}
+ORT_PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 _TENSOR_TYPES = {"float32": "tensor(float)", "float16": "tensor(float16)"}
 
 
@@ -60,14 +60,14 @@ def load_session(model: Path, provider: str, threads: int) -> tuple[ort.Inferenc
     The runtime is given bytes, never a path, so a model cannot make it read other files. Raises ModelError or ProviderError.
     """
     _check_provider(provider)
-    content = _read(model)
+    content = read_artifact(model)
     try:
-        session = ort.InferenceSession(content, session_options(threads), providers=[PROVIDERS[provider]])
+        session = ort.InferenceSession(content, session_options(threads), providers=[ORT_PROVIDERS[provider]])
     except Exception as error:  # the runtime's exceptions have no common base
         raise ModelError(
             f"{model} is not a readable ONNX model: it is damaged, of another kind, or newer than ONNX Runtime {ort.__version__}"
         ) from error
-    if PROVIDERS[provider] not in session.get_providers():
+    if ORT_PROVIDERS[provider] not in session.get_providers():
         raise ProviderError(f"ONNX Runtime could not start its {provider} provider: check the driver, or use --provider cpu")
     try:
         spec = _read_spec(session.get_modelmeta().custom_metadata_map, hashlib.sha256(content).hexdigest())
@@ -82,13 +82,14 @@ class _NotUnderstood(Exception):
 
 
 def _check_provider(provider: str) -> None:
-    if provider not in PROVIDERS:
-        raise ProviderError(f"there is no provider {provider!r}: choose one of {', '.join(PROVIDERS)}")
-    if PROVIDERS[provider] not in ort.get_available_providers():
+    if provider not in ORT_PROVIDERS:
+        raise ProviderError(f"there is no provider {provider!r}: choose one of {', '.join(ORT_PROVIDERS)}")
+    if ORT_PROVIDERS[provider] not in ort.get_available_providers():
         raise ProviderError(f"this ONNX Runtime has no {provider} provider: install it with pip install 'gamesr[{provider}]'")
 
 
-def _read(model: Path) -> bytes:
+def read_artifact(model: Path) -> bytes:
+    """The bytes of a file that could be an artifact; raises ModelError."""
     try:
         if model.stat().st_size > MAX_FILE_BYTES:
             raise ModelError(f"{model} is larger than {MAX_FILE_BYTES // 2**20} MiB: it is not a GameSR model")

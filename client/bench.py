@@ -14,10 +14,10 @@ from pathlib import Path
 
 import onnxruntime
 
-from client.artifact import PROVIDERS
 from client.errors import GamesrError
 from client.measurement import WARM_UP_FRAMES, Run, Task, measure_in_fresh_process
 from client.models import find_model, shipped_models
+from client.runtime import PROVIDERS
 from client.synthetic import write_synthetic_clip
 from client.timing import LatencySummary
 from client.upscaler import OnnxUpscaler
@@ -116,7 +116,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--clip", metavar="FILE", type=Path, help="the video to upscale (default: a made one, at two sizes)")
     parser.add_argument("--frames", metavar="N", type=_count, default=30, help="frames that count in a run (default: %(default)s)")
     parser.add_argument("--rounds", metavar="N", type=_count, default=5, help="runs of every model (default: %(default)s)")
-    parser.add_argument("--provider", choices=tuple(PROVIDERS), default="cpu", help="what runs the models (default: %(default)s)")
+    parser.add_argument("--provider", choices=PROVIDERS, default="cpu", help="what runs the models (default: %(default)s)")
     parser.add_argument("--threads", metavar="N", type=_count, help="threads of the model (default: the physical cores)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
     parser.add_argument("--debug", action="store_true", help="show where an error came from")

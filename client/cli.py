@@ -13,7 +13,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from types import FrameType
 
-from client.artifact import PROVIDERS
 from client.baselines import Baselines
 from client.compare import ComparisonWriter
 from client.errors import GamesrError, InputError, ModelError, OutputError
@@ -21,6 +20,7 @@ from client.models import DEFAULT_MODEL, find_model
 from client.pipeline import upscale_stream
 from client.progress import Progress
 from client.reference import Reference
+from client.runtime import PROVIDERS
 from client.sink import FileSink
 from client.summary import Summary
 from client.timing import Stamps
@@ -58,7 +58,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--scale", type=int, choices=(2, 3), help="how many times as wide and high (default: 2, or what the model FILE is for)"
     )
-    parser.add_argument("--provider", choices=tuple(PROVIDERS), default="cpu", help="what runs the network (default: %(default)s)")
+    parser.add_argument("--provider", choices=PROVIDERS, default="cpu", help="what runs the network (default: %(default)s)")
     parser.add_argument("--threads", metavar="N", type=_thread_count, help="threads of the network (default: the physical cores)")
     parser.add_argument(
         "--reference", metavar="HR", type=Path, help="the original, SCALE times as large: measure against it, frame by frame"

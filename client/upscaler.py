@@ -6,12 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import onnxruntime as ort
 
-from client.artifact import ModelSpec, load_session
+from client.artifact import ModelSpec
 from client.cores import physical_cores
 from client.errors import InputError, ModelError, ProviderError
 from client.frames import Frame, Plane
+from client.runtime import Binding, Runtime, load_runtime
 
 MAX_OUTPUT_PIXELS = 64 * 2**20
 
@@ -59,9 +59,9 @@ class State:
 
 
 class OnnxUpscaler:
-    """A self-describing artifact in ONNX Runtime; every network and every baseline looks the same from here.
+    """A self-describing artifact ready to run; every network and every baseline looks the same from here.
 
-    `provider` is cpu, cuda or openvino; `threads` is the number of threads of one operator, by default the physical cores
+    `provider` is one of client.runtime.PROVIDERS; `threads` is the number of threads of one operator, by default the physical cores
     available to the process. One upscaler serves any number of streams, one step at a time. Raises ModelError for a file
     that is not an artifact of ours and ProviderError for a provider that is not installed or does not start.
     """
@@ -69,8 +69,7 @@ class OnnxUpscaler:
     def __init__(self, model: Path, *, provider: str = "cpu", threads: int | None = None) -> None:
         self.provider = provider
         self.threads = threads or physical_cores()
-        self._session, self.spec = load_session(model, provider, self.threads)
-        self._device = "cuda" if provider == "cuda" else "cpu"
+        self._runtime, self.spec = load_runtime(model, provider, self.threads)
 
     def initial_state(self, height: int, width: int) -> State:
         """An empty memory for frames of `height` x `width` pixels; raises InputError when the result would be too large."""
@@ -79,7 +78,7 @@ class OnnxUpscaler:
             raise InputError(
                 f"{width}x{height} upscaled by {scale} is more than {MAX_OUTPUT_PIXELS // 2**20} megapixels: use a smaller video or scale"
             )
-        return State(_StreamBuffers(self._session, self.spec, self._device, height, width), 0, restarted=False)
+        return State(_StreamBuffers(self._runtime, self.spec, height, width), 0, restarted=False)
 
     def step(self, frame: Frame, state: State) -> tuple[Frame, State]:
         """Upscale one frame.
@@ -116,14 +115,14 @@ class OnnxUpscaler:
 class _StreamBuffers:
     """The tensors of one stream: input planes, two sets of state tensors, and the two bindings that alternate between them."""
 
-    def __init__(self, session: ort.InferenceSession, spec: ModelSpec, device: str, height: int, width: int) -> None:
+    def __init__(self, runtime: Runtime, spec: ModelSpec, height: int, width: int) -> None:
         self.height, self.width = height, width
-        self._session, self._spec, self._device = session, spec, device
+        self._runtime, self._spec = runtime, spec
         self._padded = spec.padded(height), spec.padded(width)
         self._inputs = [np.empty((1, 1, *shape), np.uint8) for shape in plane_shapes(*self._padded)]
-        self._input_tensors = [ort.OrtValue.ortvalue_from_numpy(array) for array in self._inputs]
+        self._input_tensors = [runtime.tensor(array) for array in self._inputs]
         self._arrays = [self._zeros() for _ in range(2)]
-        self._states = [[ort.OrtValue.ortvalue_from_numpy(array, device, 0) for array in arrays] for arrays in self._arrays]
+        self._states = [[runtime.tensor(array, on_device=True) for array in arrays] for arrays in self._arrays]
         self._state_sum = np.zeros((), np.float32)
         self._bindings = [self._bind(current) for current in range(2)]
 
@@ -138,11 +137,11 @@ class _StreamBuffers:
         outputs = [np.empty((1, 1, *shape), np.uint8) for shape in plane_shapes(self._padded[0] * scale, self._padded[1] * scale)]
         binding = self._bindings[current]
         for name, tensor in zip(("y", "u", "v"), self._input_tensors, strict=True):
-            binding.bind_ortvalue_input(name, tensor)  # for every frame: where the device has its own memory, binding is what copies
+            binding.bind_input(name, tensor)  # for every frame: where the device has its own memory, binding is what copies
         for name, array in zip(("y_up", "u_up", "v_up"), outputs, strict=True):
-            binding.bind_ortvalue_output(name, ort.OrtValue.ortvalue_from_numpy(array))
+            binding.bind_output(name, self._runtime.tensor(array))
         try:
-            self._session.run_with_iobinding(binding)
+            binding.run()
         except Exception as error:  # the runtime's exceptions have no common base
             reason = str(error).strip().splitlines()[0]
             raise ModelError(f"model {self._spec.name} failed on a {self.width}x{self.height} frame: {reason}") from error
@@ -154,13 +153,13 @@ class _StreamBuffers:
             tensor.update_inplace(zeros)
 
     def tensors(self, current: int) -> list[np.ndarray]:
-        if self._arrays[current] and self._device != "cpu":
+        if self._arrays[current] and self._runtime.has_own_memory:
             raise ProviderError(f"the state of {self._spec.name} lies in the memory of a device, where no part of it can be replaced")
         return self._arrays[current]  # on the CPU a tensor made from an array is that array
 
     def copy(self, current: int) -> _StreamBuffers:
         """Buffers of their own, whose state set 0 is this one's set `current`."""
-        twin = _StreamBuffers(self._session, self._spec, self._device, self.height, self.width)
+        twin = _StreamBuffers(self._runtime, self._spec, self.height, self.width)
         for target, source in zip(twin._states[0], self._states[current], strict=True):
             target.update_inplace(source.numpy())
         return twin
@@ -169,13 +168,15 @@ class _StreamBuffers:
         height, width = self._padded
         return [np.zeros((1, s.channels, height // s.divisor, width // s.divisor), s.dtype) for s in self._spec.state]
 
-    def _bind(self, current: int) -> ort.IOBinding:
-        binding = self._session.io_binding()
+    def _bind(self, current: int) -> Binding:
+        inputs = {name: array.shape for name, array in zip(("y", "u", "v"), self._inputs, strict=True)}
+        states = {state.input: array.shape for state, array in zip(self._spec.state, self._arrays[current], strict=True)}
+        binding = self._runtime.binding({**inputs, **states})
         for spec, before, after in zip(self._spec.state, self._states[current], self._states[1 - current], strict=True):
-            binding.bind_ortvalue_input(spec.input, before)
-            binding.bind_ortvalue_output(spec.output, after)
+            binding.bind_input(spec.input, before)
+            binding.bind_output(spec.output, after)
         if self._spec.state:
-            binding.bind_ortvalue_output("state_sum", ort.OrtValue.ortvalue_from_numpy(self._state_sum))
+            binding.bind_output("state_sum", self._runtime.tensor(self._state_sum))
         return binding
 
 

@@ -1,0 +1,170 @@
+"""What computes an artifact's graph: ONNX Runtime on a processor or a GPU, or OpenVINO, which has bfloat16 on processors."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Protocol
+
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import NDArray
+
+from client.artifact import ORT_PROVIDERS, ModelSpec, load_session, read_artifact
+from client.errors import ModelError, ProviderError
+
+Array = NDArray[np.generic]
+OPENVINO = ("openvino", "openvino-bfloat16")
+PROVIDERS = (*ORT_PROVIDERS, *OPENVINO)
+MAX_COMPILED_SIZES = 4
+
+
+class Tensor(Protocol):
+    """Memory that a graph reads or writes."""
+
+    def numpy(self) -> Array: ...
+
+    def update_inplace(self, array: Array) -> None: ...
+
+
+class Binding(Protocol):
+    """The tensors of one run, by the names of the graph's inputs and outputs; they may be replaced between runs."""
+
+    def bind_input(self, name: str, tensor: Any) -> None: ...
+
+    def bind_output(self, name: str, tensor: Any) -> None: ...
+
+    def run(self) -> None: ...
+
+
+class Runtime(Protocol):
+    """A graph ready to run. `tensor` gives one over `array`, without a copy, or in the device's own memory if it has one.
+
+    `binding` is for inputs of these shapes.
+    """
+
+    has_own_memory: bool
+
+    def tensor(self, array: Array, *, on_device: bool = False) -> Tensor: ...
+
+    def binding(self, shapes: Mapping[str, tuple[int, ...]]) -> Binding: ...
+
+
+def load_runtime(model: Path, provider: str, threads: int) -> tuple[Runtime, ModelSpec]:
+    """An artifact on one of PROVIDERS, and what it says of itself; raises ModelError or ProviderError."""
+    if provider not in OPENVINO:
+        session, spec = load_session(model, provider, threads)
+        return OrtRuntime(session, "cuda" if provider == "cuda" else "cpu"), spec
+    openvino()  # whether it is there is said before anything is read
+    _, spec = load_session(model, "cpu", 1)
+    return OpenVinoRuntime(read_artifact(model), threads=threads, bfloat16=provider.endswith("bfloat16")), spec
+
+
+class OrtRuntime:
+    """A session of ONNX Runtime."""
+
+    def __init__(self, session: ort.InferenceSession, device: str) -> None:
+        self._session, self._device = session, device
+        self.has_own_memory = device != "cpu"
+
+    def tensor(self, array: Array, *, on_device: bool = False) -> Tensor:
+        value: Tensor = ort.OrtValue.ortvalue_from_numpy(array, self._device if on_device else "cpu", 0)
+        return value
+
+    def binding(self, shapes: Mapping[str, tuple[int, ...]]) -> Binding:
+        return _OrtBinding(self._session)
+
+
+class _OrtBinding:
+    def __init__(self, session: ort.InferenceSession) -> None:
+        self._session, self._binding = session, session.io_binding()
+
+    def bind_input(self, name: str, tensor: Any) -> None:
+        self._binding.bind_ortvalue_input(name, tensor)
+
+    def bind_output(self, name: str, tensor: Any) -> None:
+        self._binding.bind_ortvalue_output(name, tensor)
+
+    def run(self) -> None:
+        self._session.run_with_iobinding(self._binding)
+
+
+def openvino() -> ModuleType:
+    """The module, which is an extra; raises ProviderError where it is not installed."""
+    try:
+        return importlib.import_module("openvino")
+    except ImportError as error:
+        raise ProviderError("OpenVINO is not installed: install it with pip install 'gamesr[cpu,openvino]'") from error
+
+
+class OpenVinoRuntime:
+    """A graph compiled by OpenVINO for every size that it is used at, since fixed sizes save a third of a small network's time.
+
+    With `bfloat16` the inner layers compute in it; inputs, outputs and the state stay as they are. Raises ProviderError where
+    the processor has none.
+    """
+
+    has_own_memory = False
+
+    def __init__(self, content: bytes, *, threads: int, bfloat16: bool) -> None:
+        self._ov = openvino()
+        self._core = self._ov.Core()
+        if bfloat16 and "BF16" not in self._core.get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
+            raise ProviderError("this processor does not compute in bfloat16: use --provider openvino")
+        self._content = content
+        self._options = {
+            "INFERENCE_PRECISION_HINT": "bf16" if bfloat16 else "f32",
+            "INFERENCE_NUM_THREADS": threads,
+            "NUM_STREAMS": 1,
+        }
+        self._compiled: dict[tuple[tuple[str, tuple[int, ...]], ...], Any] = {}
+
+    def tensor(self, array: Array, *, on_device: bool = False) -> Tensor:
+        return _OpenVinoTensor(self._ov, array)
+
+    def binding(self, shapes: Mapping[str, tuple[int, ...]]) -> Binding:
+        key = tuple(sorted(shapes.items()))
+        if key not in self._compiled:
+            if len(self._compiled) == MAX_COMPILED_SIZES:
+                self._compiled.pop(next(iter(self._compiled)))  # streams of that size keep what they have
+            try:
+                model = self._core.read_model(self._content)
+                model.reshape({name: list(shape) for name, shape in shapes.items()})
+                self._compiled[key] = self._core.compile_model(model, "CPU", self._options).create_infer_request()
+            except Exception as error:  # the runtime's exceptions have no common base
+                reason = str(error).strip().splitlines()[-1]
+                raise ModelError(f"OpenVINO cannot compile the model: {reason}") from error
+        return _OpenVinoBinding(self._compiled[key])
+
+
+class _OpenVinoTensor:
+    def __init__(self, ov: ModuleType, array: Array) -> None:
+        self._array = array  # OpenVINO does not keep it alive
+        self.tensor = ov.Tensor(array, shared_memory=True)
+
+    def numpy(self) -> Array:
+        return self._array
+
+    def update_inplace(self, array: Array) -> None:
+        self._array[...] = array
+
+
+class _OpenVinoBinding:
+    """The request is shared by all bindings of a size, which run one at a time: each sets its tensors anew."""
+
+    def __init__(self, request: Any) -> None:
+        self._request = request
+        self._tensors: dict[str, _OpenVinoTensor] = {}
+
+    def bind_input(self, name: str, tensor: _OpenVinoTensor) -> None:
+        self._tensors[name] = tensor
+
+    def bind_output(self, name: str, tensor: _OpenVinoTensor) -> None:
+        self._tensors[name] = tensor
+
+    def run(self) -> None:
+        for name, tensor in self._tensors.items():
+            self._request.set_tensor(name, tensor.tensor)
+        self._request.infer()
