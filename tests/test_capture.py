@@ -278,6 +278,12 @@ def test_a_scene_that_is_thrown_away_leaves_no_file_and_is_not_filmed_again(scen
         library.write_footage_list([scene])
 
 
+def test_a_game_that_hangs_is_ended_and_that_is_said(scene: SceneSpec, tmp_path: Path) -> None:
+    hanging = replace(scene, game=replace(scene.game, play=replace(scene.game.play, command=("sleep", "60"))))
+    with pytest.raises(GamesrError, match=r"frame 0 of 40: it took longer than 0.2 s \(--timeout\)"):
+        list(film_to_file(hanging, Shot(72), tmp_path / "out", clock=Path(), display=":none", timeout_s=0.2))
+
+
 def test_a_size_that_does_not_match_goes_and_the_others_stay(scene: SceneSpec, tmp_path: Path) -> None:
     library = film_all(scene, tmp_path / "out")
     low = [frame.y.copy() for frame in read_frames(excerpt(108))]

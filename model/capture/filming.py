@@ -112,11 +112,19 @@ class _Stage:
     home: Path
     log: Path
     process: subprocess.Popen[bytes]
+    timeout_s: float
+    timed_out: bool = False
+
+    def give_up(self) -> None:
+        self.timed_out = True
+        _end(self.process)
 
     def wait_for_end(self) -> None:
         self.process.wait()
 
     def last_words(self) -> str:
+        if self.timed_out:
+            return f"it took longer than {self.timeout_s:g} s (--timeout)"
         lines = [line.strip() for line in self.log.read_text(errors="replace").splitlines()]
         return next((line for line in reversed(lines) if line), "it said nothing")[:200]
 
@@ -169,10 +177,11 @@ def _game(
             except OSError as error:
                 packages = " ".join(scene.game.packages)
                 raise GamesrError(f"{scene.game.title} does not start ({error.strerror}): apt-get install {packages}") from error
-        watchdog = threading.Timer(timeout_s, _end, [process])
+        stage = _Stage(home, log, process, timeout_s)
+        watchdog = threading.Timer(timeout_s, stage.give_up)
         watchdog.start()
         try:
-            yield _Stage(home, log, process)
+            yield stage
         finally:
             watchdog.cancel()
             _end(process)
