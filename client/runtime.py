@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
@@ -16,7 +16,8 @@ from client.artifact import ORT_PROVIDERS, ModelSpec, load_session, read_artifac
 from client.errors import ModelError, ProviderError
 
 Array = NDArray[np.generic]
-OPENVINO = ("openvino", "openvino-bfloat16")
+BFLOAT16 = "openvino-bfloat16"
+OPENVINO = ("openvino", BFLOAT16)
 PROVIDERS = (*ORT_PROVIDERS, *OPENVINO)
 MAX_COMPILED_SIZES = 4
 
@@ -59,7 +60,7 @@ def load_runtime(model: Path, provider: str, threads: int) -> tuple[Runtime, Mod
         return OrtRuntime(session, "cuda" if provider == "cuda" else "cpu"), spec
     openvino()  # whether it is there is said before anything is read
     _, spec = load_session(model, "cpu", 1)
-    return OpenVinoRuntime(read_artifact(model), threads=threads, bfloat16=provider.endswith("bfloat16")), spec
+    return OpenVinoRuntime(read_artifact(model), threads=threads, bfloat16=provider == BFLOAT16), spec
 
 
 class OrtRuntime:
@@ -89,6 +90,13 @@ class _OrtBinding:
 
     def run(self) -> None:
         self._session.run_with_iobinding(self._binding)
+
+
+def is_installed(provider: str) -> bool:
+    """Whether one of PROVIDERS is there to be tried; whether it starts on this machine shows when it does."""
+    if provider in OPENVINO:
+        return importlib.util.find_spec("openvino") is not None
+    return ORT_PROVIDERS[provider] in ort.get_available_providers()
 
 
 def openvino() -> ModuleType:

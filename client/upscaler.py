@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,7 +44,8 @@ class State:
     def tensors(self) -> list[np.ndarray]:
         """The state tensors (1, channels, H/divisor, W/divisor) in the processor's memory, of which H and W are the padded size.
 
-        What is written into them is what the next step begins with. Raises ProviderError where they lie on a device.
+        They are in the order of `ModelSpec.state`. What is written into them is what the next step begins with; steps to come
+        write into them as well. Raises ProviderError where they lie on a device.
         """
         self._check()
         return self._buffers.tensors(self._current)
@@ -79,6 +81,12 @@ class OnnxUpscaler:
                 f"{width}x{height} upscaled by {scale} is more than {MAX_OUTPUT_PIXELS // 2**20} megapixels: use a smaller video or scale"
             )
         return State(_StreamBuffers(self._runtime, self.spec, height, width), 0, restarted=False)
+
+    def state_of(self, height: int, width: int, tensors: Sequence[np.ndarray]) -> State:
+        """The memory that `State.tensors` gave out, or one like it, for frames of `height` x `width` pixels."""
+        state = self.initial_state(height, width)
+        state._buffers.fill(state._current, tensors)
+        return state
 
     def step(self, frame: Frame, state: State) -> tuple[Frame, State]:
         """Upscale one frame.
@@ -149,8 +157,11 @@ class _StreamBuffers:
         return [array[0, 0, :height, :width] for array, (height, width) in zip(outputs, shapes, strict=True)], float(self._state_sum)
 
     def clear(self, current: int) -> None:
-        for tensor, zeros in zip(self._states[current], self._zeros(), strict=True):
-            tensor.update_inplace(zeros)
+        self.fill(current, self._zeros())
+
+    def fill(self, current: int, arrays: Sequence[np.ndarray]) -> None:
+        for tensor, array in zip(self._states[current], arrays, strict=True):
+            tensor.update_inplace(array)
 
     def tensors(self, current: int) -> list[np.ndarray]:
         if self._arrays[current] and self._runtime.has_own_memory:
@@ -160,8 +171,7 @@ class _StreamBuffers:
     def copy(self, current: int) -> _StreamBuffers:
         """Buffers of their own, whose state set 0 is this one's set `current`."""
         twin = _StreamBuffers(self._runtime, self._spec, self.height, self.width)
-        for target, source in zip(twin._states[0], self._states[current], strict=True):
-            target.update_inplace(source.numpy())
+        twin.fill(0, [tensor.numpy() for tensor in self._states[current]])
         return twin
 
     def _zeros(self) -> list[np.ndarray]:

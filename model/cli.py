@@ -7,6 +7,7 @@ import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,18 @@ from tqdm import tqdm
 
 from client.errors import GamesrError, InputError, ModelError
 from client.models import WEIGHTS
-from client.video import VideoSource
+from client.runtime import PROVIDERS
+from client.upscaler import OnnxUpscaler
+from client.video import read_frames
 from model.cards import card_page, training_card
 from model.evaluate import evaluate, table
 from model.export import BASELINES, export_baseline, export_network
 from model.footage import Degradation, FootageCache, load_scenes
 from model.network import PRESETS
+from model.stability import CASES, CLIP_FRAMES, HEADER, run_cases, table_row
 from model.train import TrainConfig, Trainer, load_checkpoint, network_of
-from model.verify import crop, parity, parse_size
+from model.trial import Subject
+from model.verify import crop, network_of_artifact, parity, parse_size
 
 TRAIN_EXAMPLES = """\
 The footage list is a TOML file of scenes (gamesr-footage makes one); scenes are split by map or track. A run lives in one
@@ -30,6 +35,15 @@ folder and goes on where it stopped when the same command is given again:
 
   gamesr-train footage.toml runs/openarena_x2 --games openarena --steps 20000
   gamesr-train footage.toml runs/paper_x3 --preset paper --scale 3 --device cuda
+"""
+
+VERIFY_EXAMPLES = """\
+examples:
+  gamesr-verify client/weights/gamesr_x2.onnx tests/footage/oa_koth1_540p.mp4
+  gamesr-verify client/weights/gamesr_x2.onnx tests/footage/oa_koth1_540p.mp4 --hard short
+  gamesr-verify client/weights/gamesr_x2.onnx --hard full --cases still fade
+
+hard cases (docs/stability.md says more):
 """
 
 
@@ -128,36 +142,68 @@ def export_main(argv: Sequence[str] | None = None) -> int:
 def verify_main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="gamesr-verify",
-        description="Hold an artifact in ONNX Runtime against its own weights in torch float64, over many recurrent steps of a clip.",
+        description="Hold an artifact in ONNX Runtime against its own weights in torch float64, over many recurrent steps of a clip; "
+        "with --hard, over pictures and states that are hard on a recurrent network.",
+        epilog=VERIFY_EXAMPLES + "".join(f"  {case.name:14} {case.what}\n" for case in CASES),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("model", type=Path, help="a trained .onnx artifact")
-    parser.add_argument("clip", type=Path, help="a low-resolution video; it is played forwards and backwards")
-    parser.add_argument("--steps", type=int, default=300, help="recurrent steps (default: %(default)s)")
-    parser.add_argument("--crop", default="192x108", metavar="WxH", help="the middle of the picture, both even (default: %(default)s)")
-    parser.add_argument("--json", action="store_true", help="a JSON line a step instead of the table")
+    parser.add_argument("model", type=Path, help="a trained .onnx artifact; with --hard a baseline too")
+    parser.add_argument("clip", type=Path, nargs="?", help="a low-resolution video; it is played forwards and backwards")
+    parser.add_argument("--steps", type=int, default=300, help="recurrent steps, without --hard (default: %(default)s)")
+    parser.add_argument(
+        "--crop",
+        metavar="WxH",
+        help="the middle of the picture, both even (default: 192x108; of hard cases 64x48 in short, 160x96 in full)",
+    )
+    parser.add_argument("--hard", choices=("short", "full"), help="the hard cases: short takes seconds, full up to 10,000 frames a case")
+    parser.add_argument("--cases", nargs="+", choices=[case.name for case in CASES], metavar="CASE", help="only these hard cases")
+    parser.add_argument("--provider", choices=PROVIDERS, default="cpu", help="what runs the hard cases (default: %(default)s)")
+    parser.add_argument("--json", action="store_true", help="a JSON line a step, or a hard case, instead of the table")
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     arguments = parser.parse_args(argv)
+    if arguments.hard is None and (arguments.clip is None or arguments.cases):
+        parser.error("CLIP may be left out, and --cases given, with --hard only")
+    return _run(parser, arguments, lambda: _verify_hard(arguments) if arguments.hard else _verify_parity(arguments), "stopped")
 
-    def work() -> None:
-        width, height = parse_size(arguments.crop)
-        with VideoSource(arguments.clip) as source:
-            frames = [crop(item.frame, width, height) for item in source]
-        if not frames:
-            raise InputError(f"no frame of {arguments.clip} could be decoded")
-        shown = {1, 10, 100, arguments.steps}
-        worst = 0
-        for error in parity(arguments.model, frames, arguments.steps):
-            worst = max(worst, error.max_code_error)
-            if arguments.json:
-                print(json.dumps(asdict(error)))
-            elif error.step in shown or error.step % 100 == 0:
-                picture = f"picture within {error.max_code_error} code values, {error.differing_pixels:.1e} of the samples differ"
-                state = f"state within {error.max_state_error:.1e}, RMS {error.rms_state_error:.1e}"
-                print(f"step {error.step:5}: {picture}; {state}")
-        if worst > 1:
-            raise ModelError(f"{arguments.model} differs from its float64 reference by {worst} code values")
 
-    return _run(parser, arguments, work, "stopped")
+def _verify_parity(arguments: argparse.Namespace) -> None:
+    width, height = parse_size(arguments.crop or "192x108")
+    frames = [crop(frame, width, height) for frame in read_frames(arguments.clip)]
+    if not frames:
+        raise InputError(f"no frame of {arguments.clip} could be decoded")
+    shown = {1, 10, 100, arguments.steps}
+    worst = 0
+    for error in parity(arguments.model, frames, arguments.steps):
+        worst = max(worst, error.max_code_error)
+        if arguments.json:
+            print(json.dumps(asdict(error)))
+        elif error.step in shown or error.step % 100 == 0:
+            picture = f"picture within {error.max_code_error} code values, {error.differing_pixels:.1e} of the samples differ"
+            state = f"state within {error.max_state_error:.1e}, RMS {error.rms_state_error:.1e}"
+            print(f"step {error.step:5}: {picture}; {state}")
+    if worst > 1:
+        raise ModelError(f"{arguments.model} differs from its float64 reference by {worst} code values")
+
+
+def _verify_hard(arguments: argparse.Namespace) -> None:
+    full = arguments.hard == "full"
+    width, height = parse_size(arguments.crop or ("160x96" if full else "64x48"))
+    upscaler = OnnxUpscaler(arguments.model, provider=arguments.provider)
+    network = network_of_artifact(arguments.model) if "network" in upscaler.spec.card else None
+    clip = list(islice(read_frames(arguments.clip), CLIP_FRAMES[full])) if arguments.clip else []
+    if arguments.clip and not clip:
+        raise InputError(f"no frame of {arguments.clip} could be decoded")
+    subject = Subject(arguments.model, upscaler, network, clip, width, height, full, progress=sys.stderr.isatty())
+    about = {"model": arguments.model.name, "sha256": upscaler.spec.sha256, "provider": upscaler.provider, "length": arguments.hard}
+    if not arguments.json:
+        print(HEADER, flush=True)
+    failed = []
+    for case, outcome in run_cases(subject, [case for case in CASES if case.name in (arguments.cases or [case.name])]):
+        print(json.dumps({**about, "case": case.name, **outcome.record()}) if arguments.json else table_row(case, outcome), flush=True)
+        if outcome.failures:
+            failed.append(case.name)
+    if failed:
+        raise ModelError(f"{arguments.model} fails {len(failed)} of the hard cases: {', '.join(failed)}")
 
 
 def evaluate_main(argv: Sequence[str] | None = None) -> int:

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import onnx
-import onnxruntime as ort
 import torch
 from numpy.typing import NDArray
 from onnx import numpy_helper
 
 from client.artifact import load_session
 from client.errors import InputError, ModelError
-from client.frames import Frame
+from client.frames import Frame, Plane
+from client.upscaler import OnnxUpscaler, State
 from model.export import to_codes
-from model.network import GameSR, NetworkConfig, Planes, State, deployed
+from model.hard_cases import there_and_back
+from model.network import GameSR, NetworkConfig, Planes, deployed
 
 
 @dataclass(frozen=True)
@@ -63,52 +65,88 @@ def crop(frame: Frame, width: int, height: int) -> Frame:
     return replace(frame, y=luma, u=frame.u[rows, columns], v=frame.v[rows, columns])
 
 
-def there_and_back(frames: list[Frame], steps: int) -> Iterator[Frame]:
-    """The clip played forwards, backwards and so on for `steps` frames: motion without a cut, for as long as one likes."""
-    order = list(range(len(frames))) + list(range(len(frames) - 2, 0, -1))
-    for step in range(steps):
-        yield frames[order[step % len(order)]]
+class Reference:
+    """A network in float64 on one stream, fed as the client feeds an artifact: padded to the size multiple, rounded, cropped."""
+
+    def __init__(self, network: GameSR, height: int, width: int) -> None:
+        multiple = network.config.size_multiple
+        self._network, self._multiple = network, multiple
+        self._state = network.initial_state(1, -(-height // multiple) * multiple, -(-width // multiple) * multiple)
+
+    @torch.no_grad()
+    def step(self, frame: Frame) -> list[Plane]:
+        """The upscaled planes of the next frame, uint8; raises ModelError when they are not finite."""
+        multiple, scale = self._multiple, self._network.config.scale
+        height, width = -(-frame.height // multiple) * multiple, -(-frame.width // multiple) * multiple
+        sizes = ((height, width), (height // 2, width // 2), (height // 2, width // 2))
+        planes = [
+            np.pad(plane, ((0, rows - plane.shape[0]), (0, columns - plane.shape[1])), mode="edge")
+            for plane, (rows, columns) in zip((frame.y, frame.u, frame.v), sizes, strict=True)
+        ]
+        picture, self._state = self._network.step(Planes(*(torch.from_numpy(p)[None, None].double() for p in planes)), self._state)
+        if not all(bool(plane.isfinite().all()) for plane in picture):
+            raise ModelError("its pictures are not finite even in float64: the weights are damaged")
+        high, wide = scale * frame.height, scale * frame.width
+        shapes = ((high, wide), (-(-high // 2), -(-wide // 2)), (-(-high // 2), -(-wide // 2)))
+        return [to_codes(plane)[0, 0, :rows, :columns].numpy() for plane, (rows, columns) in zip(picture, shapes, strict=True)]
+
+    def state(self) -> list[NDArray[np.float64]]:
+        return [] if self._state is None else [part.numpy() for part in self._state]
 
 
-@torch.no_grad()
+@dataclass(frozen=True)
+class Played:
+    """One frame through an artifact: the picture, how long it took, whether the state was lost, what is remembered now.
+
+    `error` is against the float64 reference, None where the artifact has none.
+    """
+
+    picture: Frame
+    duration_ns: int
+    restarted: bool
+    state: list[NDArray[np.floating]]
+    error: StepError | None
+
+
+def play(upscaler: OnnxUpscaler, network: GameSR | None, frames: Iterable[Frame]) -> Iterator[Played]:
+    """Frames of one size through an artifact, as the client runs it, and through its reference, each with its own state."""
+    state: State | None = None
+    reference: Reference | None = None
+    for step, frame in enumerate(frames, 1):
+        if state is None:
+            state = upscaler.initial_state(frame.height, frame.width)
+            reference = Reference(network, frame.height, frame.width) if network else None
+        begin_ns = time.perf_counter_ns()
+        picture, state = upscaler.step(frame, state)
+        duration_ns = time.perf_counter_ns() - begin_ns
+        tensors = state.tensors()
+        error = _error(step, picture, tensors, reference.step(frame), reference.state()) if reference else None
+        yield Played(picture, duration_ns, state.restarted, tensors, error)
+
+
 def parity(artifact: Path, frames: list[Frame], steps: int, *, threads: int = 1) -> Iterator[StepError]:
     """Run both for `steps` frames, each carrying its own state from zeros, and give the difference after every step.
 
     The artifact runs in ONNX Runtime on the CPU at its own precision; the reference is float64 throughout and rounds its
     pictures only at the end, as the artifact does.
     """
-    session, spec = load_session(artifact, "cpu", threads)
     network = network_of_artifact(artifact)
-    height, width = frames[0].height, frames[0].width
-    expected = network.initial_state(1, height, width)
-    state = {s.input: np.zeros((1, s.channels, height // s.divisor, width // s.divisor), np.float32) for s in spec.state}
-    for step, frame in enumerate(there_and_back(frames, steps), 1):
-        inputs = {name: np.ascontiguousarray(plane)[None, None] for name, plane in zip("yuv", (frame.y, frame.u, frame.v), strict=True)}
-        outputs = dict(zip([o.name for o in session.get_outputs()], _run(session, {**inputs, **state}), strict=True))
-        state = {s.input: outputs[s.output] for s in spec.state}
-        picture, expected = network.step(Planes(*(torch.from_numpy(p).double() for p in inputs.values())), expected)
-        difference = np.concatenate(
-            [
-                (to_codes(plane).numpy().astype(np.int16) - outputs[name]).ravel()
-                for name, plane in zip(("y_up", "u_up", "v_up"), picture, strict=True)
-            ]
-        )
-        drift = _state_difference(expected, list(state.values()))
-        yield StepError(
-            step,
-            int(np.abs(difference).max()),
-            float(np.count_nonzero(difference) / difference.size),
-            float(np.abs(drift).max()),
-            float(np.sqrt(np.square(drift).mean())),
-        )
+    for played in play(OnnxUpscaler(artifact, threads=threads), network, there_and_back(frames, steps)):
+        assert played.error is not None
+        yield played.error
 
 
-def _run(session: ort.InferenceSession, inputs: dict[str, NDArray[np.generic]]) -> list[NDArray[np.generic]]:
-    outputs: list[NDArray[np.generic]] = session.run(None, inputs)
-    return outputs
-
-
-def _state_difference(expected: State | None, found: list[NDArray[np.generic]]) -> NDArray[np.float64]:
-    if expected is None:
-        return np.zeros(1)
-    return np.concatenate([(a.numpy() - b).ravel() for a, b in zip(expected, found, strict=True)])
+def _error(
+    step: int, picture: Frame, state: list[NDArray[np.floating]], planes: list[Plane], expected: list[NDArray[np.float64]]
+) -> StepError:
+    difference = np.concatenate(
+        [(wanted.astype(np.int16) - found).ravel() for wanted, found in zip(planes, (picture.y, picture.u, picture.v), strict=True)]
+    )
+    drift = np.concatenate([(a - b).ravel() for a, b in zip(expected, state, strict=True)] or [np.zeros(1)])
+    return StepError(
+        step,
+        int(np.abs(difference).max()),
+        float(np.count_nonzero(difference) / difference.size),
+        float(np.abs(drift).max()),
+        float(np.sqrt(np.square(drift).mean())),
+    )

@@ -30,6 +30,35 @@ def test_fused_equals_unfused_on_every_pixel(seed: int, dtype: torch.dtype, boun
         assert ((fused - unfused).abs().max() / unfused.abs().max()).item() <= bound
 
 
+def cancelling_triple(gain: float) -> LinearTriple:
+    """Half of the wide channels carry `gain` times something, the other half the same, and the last convolution subtracts them."""
+    torch.manual_seed(4)
+    module = LinearTriple(8, 16)
+    a, b, last = torch.randn(3, 8, 8, 1, 1)
+    middle = torch.randn(8, 8, 3, 3)
+    with torch.no_grad():
+        module.expand.weight.copy_(torch.cat((a + gain * b, gain * b)))
+        module.middle.weight.zero_()
+        module.middle.weight[:8, :8] = module.middle.weight[8:, 8:] = middle
+        module.compress.weight.copy_(torch.cat((last, -last), 1))
+    return module
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("gain", [1.0, 1e3, 1e6])
+def test_fused_in_float32_is_exact_where_large_weights_cancel(gain: float) -> None:
+    """Because `fused` multiplies the weights in float64: the three convolutions in float32, and their product in it, lose what cancels."""
+    module = cancelling_triple(gain)
+    x = torch.randn(1, 8, 9, 7)
+    exact = copy.deepcopy(module).double().forward_unfused(x.double())
+    error = {
+        form: ((y - exact).abs().max() / exact.abs().max()).item()
+        for form, y in (("fused", module.fused()(x)), ("three", module.forward_unfused(x)))
+    }
+    assert error["fused"] < 2e-6
+    assert gain == 1 or error["three"] > 100 * error["fused"]
+
+
 def test_padding_after_the_expansion_would_be_wrong_on_the_border() -> None:
     module = triple(0, torch.float64)
     x = torch.randn(1, 8, 6, 6, dtype=torch.float64)

@@ -102,6 +102,20 @@ def test_a_copy_goes_on_from_where_it_was_taken(model_file: ModelFile) -> None:
     assert all(same(a, b) for a, b in zip(run(upscaler, tail, state), run(upscaler, tail, kept), strict=True))
 
 
+def test_a_state_goes_on_from_what_it_gave_out(model_file: ModelFile) -> None:
+    upscaler = OnnxUpscaler(model_file())
+    _, state = upscaler.step(noise(0), upscaler.initial_state(10, 14))
+    tensors = [tensor.copy() for tensor in state.tensors()]
+    assert [tensor.shape for tensor in tensors] == [(1, 1, 5, 7)] and np.ptp(tensors[0]) > 0
+    tail = [noise(seed) for seed in range(1, 4)]
+    again = upscaler.state_of(10, 14, tensors)
+    expected = run(upscaler, tail, state)
+    assert all(same(a, b) for a, b in zip(expected, run(upscaler, tail, again), strict=True))
+    assert all(same(a, b) for a, b in zip(expected, run(upscaler, tail, upscaler.state_of(10, 14, tensors)), strict=True))
+    with pytest.raises(ValueError, match="consumed"):
+        state.tensors()
+
+
 def test_streams_on_one_upscaler_do_not_mix(model_file: ModelFile) -> None:
     upscaler = OnnxUpscaler(model_file())
     ours, theirs = [noise(seed) for seed in range(4)], [noise(seed) for seed in range(10, 14)]

@@ -1,0 +1,268 @@
+"""The hard cases: pictures that are what they are called, artifacts that pass, and broken ones that must not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from client.frames import Frame
+from client.models import find_model
+from client.quality import psnr_db, squared_error
+from client.upscaler import OnnxUpscaler
+from model import hard_cases as pictures
+from model.cli import verify_main
+from model.export import export_network
+from model.network import GameSR, NetworkConfig
+from model.probes import same_picture
+from model.stability import CASES, HEADER, Case, run_cases, table_row
+from model.trial import Outcome, Subject, tally
+from model.verify import Played, StepError, network_of_artifact
+from tests.moving import write_footage
+
+Make = Callable[[int, int, int], Iterator[Frame]]
+SIZE = (32, 24)
+MADE = [
+    pictures.black,
+    pictures.white,
+    pictures.saturated,
+    pictures.checkerboard,
+    pictures.lines,
+    pictures.text,
+    pictures.noise,
+    pictures.grain,
+    pictures.flashes,
+    pictures.fade,
+    pictures.cuts,
+    pictures.hud,
+    pictures.limited_range,
+    pictures.full_range,
+]
+NOT_TIMED = [case.name for case in CASES if case.name != "denormals"]  # the one case that is decided by a clock
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny network with every weight away from zero as tiny.onnx, and a clip of 12 frames, 144x96, as clip.mkv."""
+    folder = tmp_path_factory.mktemp("stability")
+    torch.manual_seed(0)
+    network = GameSR(NetworkConfig(channels=8, expanded=8, blocks=1, learned_base=True, skip=True))
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    export_network(network.eval(), folder / "tiny.onnx", name="tiny", card={"steps": 0})
+    write_footage(folder)
+    return folder
+
+
+def subject(model: Path) -> Subject:
+    upscaler = OnnxUpscaler(model, threads=1)
+    network = network_of_artifact(model) if "network" in upscaler.spec.card else None
+    return Subject(model, upscaler, network, [], *SIZE, full=False)
+
+
+def outcomes(model: Path, *names: str) -> dict[str, Outcome]:
+    return {case.name: outcome for case, outcome in run_cases(subject(model), [case for case in CASES if case.name in names])}
+
+
+def changed(model: Path, path: Path, change: Callable[[onnx.GraphProto], None]) -> Path:
+    proto = onnx.load(model)
+    change(proto.graph)
+    onnx.save(proto, path)
+    return path
+
+
+def with_gate_bias(values: Callable[[np.ndarray], np.ndarray]) -> Callable[[onnx.GraphProto], None]:
+    def change(graph: onnx.GraphProto) -> None:
+        tensor = next(t for t in graph.initializer if t.name == "network.lstm.gates.bias")
+        bias = values(onnx.numpy_helper.to_array(tensor).copy())
+        tensor.CopyFrom(onnx.numpy_helper.from_array(bias.astype(np.float32), tensor.name))
+
+    return change
+
+
+@pytest.mark.parametrize("make", MADE)
+def test_pictures_are_frames_of_their_size_and_the_same_every_time(make: Make) -> None:
+    frames = list(make(*SIZE, 9))
+    assert len(frames) == 9
+    for frame, again in zip(frames, make(*SIZE, 9), strict=True):
+        assert [(p.shape, p.dtype) for p in (frame.y, frame.u, frame.v)] == [
+            ((24, 32), np.uint8),
+            ((12, 16), np.uint8),
+            ((12, 16), np.uint8),
+        ]
+        assert same_picture(frame, again)
+
+
+@pytest.mark.parametrize("make", [m for m in MADE if m not in (pictures.black, pictures.white, pictures.cuts)])
+def test_what_is_no_still_changes_from_frame_to_frame(make: Make) -> None:
+    frames = list(make(*SIZE, 9))
+    assert not any(same_picture(a, b) for a, b in pairwise(frames))
+
+
+def test_the_checkerboard_is_at_the_nyquist_limit_of_every_axis() -> None:
+    clip = np.stack([frame.y for frame in pictures.checkerboard(*SIZE, 4)]).astype(float)
+    spectrum = np.abs(np.fft.fftn(clip - clip.mean()))
+    assert spectrum[2, 12, 16] == pytest.approx(spectrum.sum())
+
+
+def test_a_fade_never_leaves_the_way_to_black() -> None:
+    clip = [np.concatenate([(f.y - 16.0).ravel(), (f.u - 128.0).ravel(), (f.v - 128.0).ravel()]) for f in pictures.fade(*SIZE, 30)]
+    assert np.ptp(clip[0]) > 50 and not clip[-1].any()
+    assert all((np.abs(later) <= np.abs(earlier)).all() and (later * earlier >= 0).all() for earlier, later in pairwise(clip))
+
+
+def test_flashes_alternate_and_cuts_cut() -> None:
+    flashes = list(pictures.flashes(*SIZE, 4))
+    assert same_picture(flashes[0], flashes[2]) and same_picture(flashes[1], flashes[3])
+    assert (flashes[1].y - flashes[0].y == 219).all()
+    scenes = list(pictures.cuts(*SIZE, 24))
+    changes = [not same_picture(a, b) for a, b in pairwise(scenes)]
+    assert [index for index, change in enumerate(changes, 1) if change] == [8, 16]
+
+
+def test_ranges_are_used_up_and_text_scrolls_by_a_pixel() -> None:
+    for make, luma, chroma in ((pictures.full_range, (0, 255), (0, 255)), (pictures.limited_range, (16, 235), (16, 240))):
+        frames = list(make(96, 64, 16))
+        assert np.array_equal(np.unique([f.y for f in frames]), np.arange(luma[0], luma[1] + 1))
+        for plane in ("u", "v"):
+            codes = np.unique([getattr(f, plane) for f in frames])
+            assert np.array_equal(codes, np.arange(chroma[0], chroma[1] + 1))
+    first, second = pictures.text(*SIZE, 2)
+    assert np.array_equal(second.y[:-1], first.y[1:])
+
+
+def test_a_clip_goes_there_and_back_without_a_cut() -> None:
+    frames = list(pictures.noise(*SIZE, 4))
+    played = list(pictures.there_and_back(frames, 9))
+    assert [next(i for i, f in enumerate(frames) if f is p) for p in played] == [0, 1, 2, 3, 2, 1, 0, 1, 2]
+
+
+def test_blocking_leaves_every_frame_and_little_of_it() -> None:
+    frames = list(pictures.hud(96, 64, 6))
+    left = pictures.blocking(frames, 0.02)
+    assert len(left) == 6
+    assert all(psnr_db(squared_error(a.y, b.y) / a.y.size) < 30 for a, b in zip(frames, left, strict=True))
+
+
+def test_a_sound_network_passes_every_case(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = [str(folder / "tiny.onnx"), str(folder / "clip.mkv"), "--hard", "short", "--crop", "32x24", "--cases", *NOT_TIMED]
+    assert verify_main([*command, "--json"]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [row["case"] for row in rows] == NOT_TIMED
+    for row in rows:
+        if row["case"] == "providers":
+            continue  # what there is to compare depends on the installed runtime
+        assert row["passed"] is True and row["nan_frames"] == 0 and row["steps"] > 0, row
+        if row["case"] != "lost-state":
+            assert row["max_code_error"] <= 1 and row["max_state_error"] < 1e-4, row
+    assert {row["model"] for row in rows} == {"tiny.onnx"}
+    by_name = {row["case"]: row for row in rows}
+    assert (by_name["full-size"]["width"], by_name["full-size"]["height"]) == (144, 96)
+    assert [error["step"] for error in by_name["footage"]["errors_at"]] == [1, 10]
+    assert by_name["lost-state"]["remark"] == "10 of 12 caught and reset"  # a lone Inf in h saturates the gates and is gone
+
+
+def test_denormals_are_gone_after_a_frame(folder: Path) -> None:
+    outcome = outcomes(folder / "tiny.onnx", "denormals")["denormals"]
+    assert outcome.subnormals == 0 and "times as long" in outcome.remark
+
+
+def test_a_shipped_model_passes_where_states_move_most() -> None:
+    found = outcomes(find_model("gamesr", 2), "cuts", "flashes", "full-range", "lost-state")
+    assert len(found) == 4 and all(outcome.passed for outcome in found.values()), found
+
+
+def test_a_baseline_has_no_errors_to_report_but_must_hold_still(capsys: pytest.CaptureFixture[str]) -> None:
+    command = [str(find_model("bicubic", 3)), "--hard", "short", "--crop", "32x24", "--cases"]
+    assert verify_main([*command, "footage", "still", "sizes", "lost-state", "denormals", "threads"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "\n".join(lines[:2]) == HEADER
+    assert all(line.count("|") == 13 for line in lines)
+    results = {line.split(" | ")[0].removeprefix("| "): line.split(" | ")[-1].removesuffix(" |") for line in lines[2:]}
+    assert results["footage"] == "left out: no clip was given"
+    assert results["lost-state"] == results["denormals"] == "left out: it has no state"
+    assert all(results[name].startswith("pass") for name in ("still", "sizes", "threads"))
+
+
+def test_a_forget_gate_that_never_forgets_fails_the_still(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    open_gate = with_gate_bias(lambda bias: bias + 30 * (np.arange(32) // 8 == 1))
+    broken = changed(folder / "tiny.onnx", tmp_path / "broken.onnx", open_gate)
+    assert verify_main([str(broken), "--hard", "short", "--crop", "32x24", "--cases", "still", "threads"]) == 1
+    said = capsys.readouterr()
+    assert "the state still moves by" in said.out and "| **FAIL**; " in said.out
+    assert said.err == f"gamesr-verify: {broken} fails 1 of the hard cases: still\n"
+
+
+def test_a_graph_that_computes_something_else_than_its_weights_say_fails(folder: Path, tmp_path: Path) -> None:
+    def other_epsilon(graph: onnx.GraphProto) -> None:
+        norms = [node for node in graph.node if node.op_type == "LayerNormalization"]
+        assert norms
+        for node in norms:
+            next(a for a in node.attribute if a.name == "epsilon").f = 0.05
+
+    broken = changed(folder / "tiny.onnx", tmp_path / "broken.onnx", other_epsilon)
+    found = outcomes(broken, "lines", "noise", "sizes", "hud")
+    assert all(outcome.passed is False for outcome in found.values()), found
+
+
+def test_weights_that_are_not_finite_fail_case_by_case(folder: Path, tmp_path: Path) -> None:
+    broken = changed(folder / "tiny.onnx", tmp_path / "broken.onnx", with_gate_bias(lambda bias: bias * np.nan))
+    found = outcomes(broken, "black", "lost-state")
+    assert all("loses its state even when it starts from zeros" in outcome.failures[0] for outcome in found.values())
+
+
+def test_growing_errors_and_lost_states_are_failures(folder: Path) -> None:
+    tested = subject(folder / "tiny.onnx")
+    picture = next(pictures.black(64, 48, 1))
+    state = [np.ones((1, 8, 12, 16), np.float32)]
+
+    def played(slope: float) -> Iterator[Played]:
+        for step in range(1, 301):
+            yield Played(picture, 1000, False, state, StepError(step, 0, 0.0, 1e-7, 1e-7 + slope * step))
+
+    assert tally(tested, played(0.0)).passed
+    drifting = tally(tested, played(1e-8))
+    assert drifting.drift_per_1000_frames == pytest.approx(1e-5) and drifting.failures == (
+        "1e-05 of drift per 1,000 frames, at most 1e-06 allowed",
+    )
+    lost = tally(tested, (replace(frame, restarted=index == 7) for index, frame in enumerate(played(0.0))))
+    assert lost.nan_frames == 1 and lost.failures == ("the state was lost in 1 frames",)
+
+
+@pytest.mark.parametrize(("codes", "fails"), [([100, 101] * 4, "flicker"), ([100, 103, 103, 103, 106, 109, 109, 109], "change by 3 codes")])
+def test_a_still_that_flickers_or_drifts_fails(folder: Path, monkeypatch: pytest.MonkeyPatch, codes: list[int], fails: str) -> None:
+    def play_codes(*_: object) -> Iterator[Played]:
+        for code in codes:
+            yield Played(Frame(*(np.full(shape, code, np.uint8) for shape in ((48, 64), (24, 32), (24, 32)))), 1000, False, [], None)
+
+    monkeypatch.setattr("model.trial.play", play_codes)
+    still = next(case for case in CASES if case.name == "still")
+    ((_, outcome),) = run_cases(subject(folder / "tiny.onnx"), [replace(still, short=len(codes))])
+    assert any(fails in failure for failure in outcome.failures), outcome.failures
+
+
+def test_a_precision_without_bounds_is_refused(folder: Path, tmp_path: Path) -> None:
+    proto = onnx.load(folder / "tiny.onnx")
+    next(p for p in proto.metadata_props if p.key == "precision").value = "float8"
+    onnx.save(proto, tmp_path / "float8.onnx")
+    assert verify_main([str(tmp_path / "float8.onnx"), "--hard", "short", "--cases", "black"]) == 1
+
+
+@pytest.mark.parametrize("arguments", [[], ["--cases", "black"], ["clip.mkv", "--cases", "black"]])
+def test_a_clip_may_be_missing_and_cases_be_named_with_hard_only(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        verify_main(["model.onnx", *arguments])
+    assert "with --hard only" in capsys.readouterr().err
+
+
+def test_a_row_says_what_it_does_not_know() -> None:
+    case = Case("name", "", lambda *_: Outcome(2, 2, 0), 1, 1)
+    assert table_row(case, Outcome(160, 96, 1000)) == "| name | 160x96 | 1,000 | - | - | - | - | - | - | 0 | - | pass |"
