@@ -39,7 +39,8 @@ how it is measured:
   Every run has a fresh process, and the models take turns in every round, so that a busy moment of the machine does not
   fall on one of them alone. Each figure is the median over the rounds of that round's figure; max and memory are the
   largest. The first {WARM_UP_FRAMES} frames are warm-up and count only for "first": the time to load the model and that of its first
-  step. "vs {YARDSTICK}" compares the p95 of upscale. Memory is the peak of the whole process. Nothing is encoded: write is
+  step. "vs {YARDSTICK}" compares the p95 of upscale. Memory is the peak of the whole process. Parameters and GMAC
+  (10^9 multiply-accumulates of a frame, by trained convolutions) are what the model's card says. Nothing is encoded: write is
   the handing over of the picture. A player upscales 640x360 by 3 or 960x540 by 2 to reach 1920x1080.
 
 Exit status: 0 done, 1 refused or failed (one sentence says why), 2 wrong usage, 130 interrupted.
@@ -56,6 +57,14 @@ class Result:
     @property
     def title(self) -> str:
         return f"{self.runs[0].spec.name} x{self.runs[0].spec.scale}"
+
+    @property
+    def complexity(self) -> tuple[str, str]:
+        """Parameters, and multiply-accumulates of a frame of this size, in words; empty where the model's card does not say."""
+        run = self.runs[0]
+        parameters, macs = run.spec.card.get("parameters"), run.spec.card.get("macs_540p")
+        here = None if macs is None else macs * (run.width * run.height) / (960 * 540)
+        return "" if parameters is None else f"{parameters / 1e3:.1f}K parameters", "" if here is None else f"{here / 1e9:.1f} GMAC"
 
     @property
     def fps(self) -> float:
@@ -83,7 +92,14 @@ class Result:
         """Every figure, ready for JSON."""
         run = self.runs[0]
         return {
-            "model": {"name": run.spec.name, "sha256": run.spec.sha256, "scale": run.spec.scale, "precision": run.spec.precision},
+            "model": {
+                "name": run.spec.name,
+                "sha256": run.spec.sha256,
+                "scale": run.spec.scale,
+                "precision": run.spec.precision,
+                "parameters": run.spec.card.get("parameters"),
+                "macs_540p": run.spec.card.get("macs_540p"),
+            },
             "input": {"width": run.width, "height": run.height},
             "frames": run.latency_us["total"].count,
             "latency_us": self.latency_us(),
@@ -208,9 +224,9 @@ def _table(results: Sequence[Result], arguments: argparse.Namespace) -> str:
             size = run.width, run.height
             heads = ("p50", "p95", "p99", "max", "frames/s", f"vs {YARDSTICK}", "first", "peak MiB")
             lines += ["", f"{f'{size[0]}x{size[1]} in':<28}" + "".join(f"{head:>12}" for head in heads)]
-        for stage, latency in result.latency_us().items():
-            label = f"{result.title if stage == 'decode' else '':<20}{stage:<8}"
-            lines.append(label + "".join(f"{value / 1000:>12.2f}" for value in latency.values()))
+        parameters, macs = result.complexity
+        for label, (stage, latency) in zip((result.title, f"  {parameters}", f"  {macs}", ""), result.latency_us().items(), strict=True):
+            lines.append(f"{label:<20}{stage:<8}" + "".join(f"{value / 1000:>12.2f}" for value in latency.values()))
         memory = "-" if result.peak_memory_mib is None else f"{result.peak_memory_mib:.0f}"
         lines[-1] += f"{result.fps:>12.1f}{result.ratio:>12.2f}{result.first_frame_ms:>12.1f}{memory:>12}"
     return "\n".join(lines)

@@ -52,7 +52,8 @@ def card_page(name: str, scale: int, card: Card) -> str:
     lines = [
         f"# {name} x{scale}",
         "",
-        f"{card['parameters']:,} parameters ({card['parameters_in_training']:,} in training), float32.",
+        f"{card['parameters']:,} parameters ({card['parameters_in_training']:,} in training), float32; "
+        f"{card['macs_540p'] / 1e9:.2f} GMAC for a frame of 960x540.",
         "",
         *earlier,
         f"- Command: `{card['command']}`",

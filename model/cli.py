@@ -20,10 +20,10 @@ from client.runtime import PROVIDERS
 from client.upscaler import OnnxUpscaler
 from client.video import read_frames
 from model.cards import card_page, training_card
+from model.catalogue import NAMES
 from model.evaluate import evaluate, table
 from model.export import BASELINES, export_baseline, export_network
 from model.footage import Degradation, FootageCache, load_scenes
-from model.network import PRESETS
 from model.stability import CASES, CLIP_FRAMES, HEADER, run_cases, table_row
 from model.train import TrainConfig, Trainer, load_checkpoint, network_of
 from model.trial import Subject
@@ -51,13 +51,13 @@ def train_main(argv: Sequence[str] | None = None) -> int:
     defaults = {f.name: f.default for f in fields(TrainConfig)}
     parser = argparse.ArgumentParser(
         prog="gamesr-train",
-        description="Train a GameSR network on game footage degraded as a cloud encoder degrades it.",
+        description="Train a GameSR network, or a published one beside it, on game footage degraded as a cloud encoder degrades it.",
         epilog=TRAIN_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("footage", type=Path, help="the footage list, a TOML file")
     parser.add_argument("run", type=Path, help="the run's folder: checkpoint.pt and log.jsonl")
-    parser.add_argument("--preset", choices=sorted(PRESETS), default=defaults["preset"], help="the network (default: %(default)s)")
+    parser.add_argument("--preset", choices=sorted(NAMES), default=defaults["preset"], help="the network (default: %(default)s)")
     parser.add_argument("--scale", type=int, choices=(2, 3), default=defaults["scale"], help="upscaling factor (default: %(default)s)")
     parser.add_argument("--games", nargs="+", default=[], metavar="GAME", help="train on these games only (default: all)")
     parser.add_argument(
@@ -131,9 +131,9 @@ def export_main(argv: Sequence[str] | None = None) -> int:
             return
         checkpoint = load_checkpoint(Path(arguments.weights))
         network = network_of(checkpoint)
-        path = arguments.folder / f"{arguments.name}_x{network.config.scale}.onnx"
+        path = arguments.folder / f"{arguments.name}_x{network.scale}.onnx"
         card = export_network(network, path, name=arguments.name, card=training_card(checkpoint))
-        path.with_suffix(".md").write_text(card_page(arguments.name, network.config.scale, card))
+        path.with_suffix(".md").write_text(card_page(arguments.name, network.scale, card))
         print(path)
 
     return _run(parser, arguments, work, "stopped")

@@ -35,7 +35,8 @@ def evaluate(
     """Every combination as a row of figures; rows already in `store` (JSON lines) are read from it, new ones appended.
 
     Speed is not measured here but by gamesr-bench, so rows may be made while something else runs. A row is known by clip,
-    scale, number of frames and the artifact's digest. Raises what reading footage and models raises.
+    scale, number of frames and the artifact's digest; what its card says of parameters and multiply-accumulates stands in the
+    row too. Raises what reading footage and models raises.
     """
     known = _read_rows(store)
     for scale in scales:
@@ -50,7 +51,7 @@ def evaluate(
                         row = {**key, **_measure(pair, upscaler, frames)}
                         with store.open("a") as file:
                             file.write(json.dumps(row) + "\n")
-                    yield row
+                    yield {**row, "parameters": spec.card.get("parameters"), "macs_540p": spec.card.get("macs_540p")}
 
 
 def _measure(pair: Pair, upscaler: OnnxUpscaler, frames: int) -> Row:
@@ -85,11 +86,13 @@ def table(rows: Iterable[Row]) -> str:
         title, degradation = row["clip"].split()
         groups.setdefault((title.split("/")[0], row["scale"], degradation, row["model"]), []).append(row)
     lines = [
-        "| game | scale | input | model | PSNR-Y | PSNR-U | PSNR-V | SSIM-Y | VMAF | VMAF-NEG | temporal error |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| game | scale | input | model | PSNR-Y | PSNR-U | PSNR-V | SSIM-Y | VMAF | VMAF-NEG | temporal error | parameters | GMAC, 540p |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for (game, scale, degradation, model), group in groups.items():
+        parameters, macs = group[0]["parameters"], group[0]["macs_540p"]
         cells = [_mean(group, name, digits) for name, digits in _COLUMNS]
+        cells += ["" if parameters is None else f"{parameters:,}", "" if macs is None else f"{macs / 1e9:.1f}"]
         lines.append(f"| {game} | x{scale} | {degradation} | {model} | {' | '.join(cells)} |")
     return "\n".join(lines)
 

@@ -9,7 +9,6 @@ import os
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from model.complexity import macs, parameter_count
 from model.fsr1 import SHARPNESS_STOPS, Fsr1
 from model.interpolation import Interpolation, chroma_shift
-from model.network import GameSR, Planes, State, deployed, parameter_count
+from model.planes import Network, Planes, State
 from model.reach import network_reach, reach
 
 FORMAT_VERSION = "1"
@@ -74,37 +74,45 @@ class Fsr1Baseline(nn.Module):
 class Frontend(nn.Module):
     """A network behind the artifact's contract: casts, rounding, clamping and the sum of the state are part of the graph."""
 
-    def __init__(self, network: GameSR) -> None:
+    def __init__(self, network: Network) -> None:
         super().__init__()
         self.network = network
 
     def forward(self, y: Tensor, u: Tensor, v: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        frame = Planes(*(p.to(self.network.stem.weight.dtype) for p in (y, u, v)))
+        frame = Planes(*(p.to(self.network.weight.dtype) for p in (y, u, v)))
         planes, after = self.network.step(frame, State(*state) if state else None, to_codes)
         if after is None:
             return planes
         return (*planes, *after, after.h.sum() + after.c.sum())
 
 
-def export_network(network: GameSR, path: Path, *, name: str, card: dict[str, Any]) -> dict[str, Any]:
+def export_network(network: Network, path: Path, *, name: str, card: dict[str, Any]) -> dict[str, Any]:
     """Fuse and write a network; `card` says where its weights come from and is returned whole, shape and counts added.
 
+    The counts are of the form that runs: its parameters, and `macs_540p`, the multiply-accumulates of a 960x540 frame.
     `network` itself is left as it is.
     """
-    config = network.config
-    fused = deployed(copy.deepcopy(network).float().eval())
-    state = [] if fused.lstm is None else [state_entry(part, config.channels, config.unshuffle) for part in State._fields]
-    card = {**card, "network": asdict(config), "parameters": parameter_count(fused), "parameters_in_training": parameter_count(network)}
+    fused = copy.deepcopy(network).float().eval().deployed()
+    state = fused.initial_state(1, *TRACED)
+    parts = [] if state is None else list(zip(State._fields, state, strict=True))
+    divisor = TRACED[0] // parts[0][1].shape[2] if parts else 1
+    card = {
+        **card,
+        "network": network.description,
+        "parameters": parameter_count(fused),
+        "parameters_in_training": parameter_count(network),
+        "macs_540p": macs(fused),
+    }
     metadata = {
         "name": name,
-        "scale": config.scale,
-        "size_multiple": config.size_multiple,
+        "scale": network.scale,
+        "size_multiple": network.size_multiple,
         "precision": "float32",
-        "state": state,
+        "state": [state_entry(part, tensor.shape[1], divisor) for part, tensor in parts],
         "reach": network_reach(copy.deepcopy(fused).double()),
         "card": card,
     }
-    _write(Frontend(fused), path, fused.initial_state(1, *TRACED), config.unshuffle, metadata)
+    _write(Frontend(fused), path, state, divisor, metadata)
     return card
 
 
@@ -143,6 +151,20 @@ def _quiet_exporter() -> Iterator[None]:
         logger.setLevel(level)
 
 
+def _name_slopes(module: nn.Module, graph: onnx.GraphProto) -> None:
+    """Call PReLU's slopes in the graph by their parameters' names, as every other weight is: the exporter shapes them anew, nameless."""
+    names = [f"{name}.weight" for name, part in module.named_modules() if isinstance(part, nn.PReLU)]
+    tensors = {tensor.name: tensor for tensor in graph.initializer}
+    for name, node in zip(names, (node for node in graph.node if node.op_type == "PRelu"), strict=True):
+        slopes = onnx.TensorProto()
+        slopes.CopyFrom(tensors[node.input[1]])
+        slopes.name = node.input[1] = name
+        graph.initializer.append(slopes)
+    used = {name for node in graph.node for name in node.input}
+    for tensor in [tensor for tensor in graph.initializer if tensor.name not in used]:
+        graph.initializer.remove(tensor)
+
+
 def _write(module: nn.Module, path: Path, state: State | None, divisor: int, metadata: dict[str, Any]) -> None:
     chroma = torch.zeros(1, 1, TRACED[0] // 2, TRACED[1] // 2, dtype=torch.uint8)
     luma = torch.zeros(1, 1, *TRACED, dtype=torch.uint8)
@@ -168,6 +190,7 @@ def _write(module: nn.Module, path: Path, state: State | None, divisor: int, met
     assert program is not None
     model = program.model_proto
     graph = model.graph
+    _name_slopes(module, graph)
     for traced in (*graph.node, *graph.value_info, *graph.initializer, *graph.input, *graph.output):
         del traced.metadata_props[:]  # where in whose files it was traced: half a megabyte that says nothing to a client
     for key, value in {"gamesr_format": FORMAT_VERSION, **metadata}.items():

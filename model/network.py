@@ -7,8 +7,8 @@ blocks between the decoder's own Y, U and V planes, without any colour conversio
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from dataclasses import asdict, dataclass
+from typing import Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -16,29 +16,8 @@ from torch.nn import functional as F
 
 from model.colour import PlanesToRgb, RgbToPlanes
 from model.interpolation import Interpolation, LearnedInterpolation, chroma_shift
-from model.reparam import LinearTriple, fuse
-
-
-class Planes(NamedTuple):
-    """The planes of 4:2:0 frames as 8-bit code values held in floats: y (..., 1, H, W), u and v (..., 1, H/2, W/2)."""
-
-    y: Tensor
-    u: Tensor
-    v: Tensor
-
-    def flatten_time(self) -> Planes:
-        """(N, T, 1, H, W) planes as (N*T, 1, H, W)."""
-        return Planes(*(plane.flatten(0, 1) for plane in self))
-
-    def unflatten_time(self, batch: int) -> Planes:
-        return Planes(*(plane.reshape(batch, -1, *plane.shape[1:]) for plane in self))
-
-
-class State(NamedTuple):
-    """The ConvLSTM's hidden and cell state, each (N, channels, H/unshuffle, W/unshuffle)."""
-
-    h: Tensor
-    c: Tensor
+from model.planes import Network, Planes, State
+from model.reparam import LinearTriple
 
 
 @dataclass(frozen=True)
@@ -140,7 +119,7 @@ class MergedHead(nn.Module):
         return out
 
 
-class GameSR(nn.Module):
+class GameSR(Network):
     """The network of a `NetworkConfig`: `step` takes a frame and a state, `forward` a clip; both are the same graph.
 
     Pictures go in and come out as `Planes` of float code values; the output is neither rounded nor clamped. The head's
@@ -148,7 +127,7 @@ class GameSR(nn.Module):
     """
 
     def __init__(self, config: NetworkConfig) -> None:
-        super().__init__()
+        super().__init__(config.scale, config.size_multiple, asdict(config))
         self.config = config
         c, s, r = config.channels, config.unshuffle, config.scale
         side = s * r
@@ -210,7 +189,14 @@ class GameSR(nn.Module):
             features = remembered + features if self.config.skip else remembered
         return self._picture(frames, source, features, lambda samples: samples).unflatten_time(batch), state
 
-    def merge_base(self) -> None:
+    def deployed(self) -> Self:
+        """Triples become one convolution, and the base goes into the head where it reaches one cell."""
+        super().deployed()
+        if self.config.colour == "planes" and self.config.unshuffle >= 4:
+            self._merge_base()
+        return self
+
+    def _merge_base(self) -> None:
         """Make the head and the base under it one convolution, in place; only of a fused network whose base reaches one cell."""
         assert isinstance(self.head, nn.Conv2d) and self.head.bias is not None
         bases = [base.kernel().double() for base in (self.luma_base, self.chroma_base, self.chroma_base)]
@@ -284,15 +270,3 @@ def block_diagonal(kernels: list[Tensor]) -> Tensor:
         whole[row : row + kernel.shape[0], column : column + kernel.shape[1]] = kernel
         row, column = row + kernel.shape[0], column + kernel.shape[1]
     return whole
-
-
-def deployed(network: GameSR) -> GameSR:
-    """The network in the form that runs, in place: triples as one convolution, and the base in the head where it reaches one cell."""
-    fuse(network)
-    if network.config.colour == "planes" and network.config.unshuffle >= 4:
-        network.merge_base()
-    return network
-
-
-def parameter_count(network: nn.Module) -> int:
-    return sum(p.numel() for p in network.parameters())

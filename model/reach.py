@@ -11,12 +11,12 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from model.network import GameSR, Planes, State
+from model.planes import Network, Planes, State
 
 MAX_CELLS = 32
 
 
-def network_reach(network: GameSR) -> int | None:
+def network_reach(network: Network) -> int | None:
     """The reach of one step of a network, from its frame and its state to its picture and its next state; see `reach`.
 
     The network is one in float64: in float32 a convolution may be computed in blocks, through which a NaN spreads.
@@ -25,12 +25,13 @@ def network_reach(network: GameSR) -> int | None:
     def step(frame: Planes) -> Sequence[Tensor]:
         state = network.initial_state(1, *frame.y.shape[2:])
         if state is not None:  # a state of NaN in the cells where the frame is one
-            lost = torch.isnan(frame.y[:, :, :: network.config.unshuffle, :: network.config.unshuffle])
+            divisor = frame.y.shape[2] // state.h.shape[2]
+            lost = torch.isnan(frame.y[:, :, ::divisor, ::divisor])
             state = State(*(part.masked_fill(lost, torch.nan) for part in state))
         picture, after = network.step(frame, state)
         return [*picture, *(after or ())]
 
-    return reach(step, network.config.size_multiple)
+    return reach(step, network.size_multiple)
 
 
 def reach(function: Callable[[Planes], Sequence[Tensor]], multiple: int) -> int | None:

@@ -7,7 +7,7 @@ import os
 import subprocess
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -18,8 +18,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from client.errors import InputError, ModelError
+from model.catalogue import NAMES, described_network, network_of_preset
 from model.footage import Degradation, FootageCache, Pair, by_game, load_pairs, load_scenes, sample_clips
-from model.network import PRESETS, GameSR, NetworkConfig, Planes, State
+from model.planes import Network, Planes, State
 
 CHECKPOINT_FORMAT = 1
 
@@ -54,13 +55,14 @@ class TrainConfig:
     initial_weights: str = ""
 
     def __post_init__(self) -> None:
-        if self.preset not in PRESETS:
-            raise InputError(f"no network is called {self.preset!r}: there are {', '.join(PRESETS)}")
+        if self.preset not in NAMES:
+            raise InputError(f"no network is called {self.preset!r}: there are {', '.join(NAMES)}")
         if self.frames % self.window or self.patch % 2:
             raise InputError("the clip length must be a multiple of the window, and the patch even")
 
-    def network(self) -> NetworkConfig:
-        return NetworkConfig(scale=self.scale, **PRESETS[self.preset])  # type: ignore[arg-type]
+    def network(self) -> Network:
+        """The untrained network."""
+        return network_of_preset(self.preset, self.scale)
 
     def rate_at(self, step: int) -> float:
         warm = min(1.0, (step + 1) / self.warm_up_steps)
@@ -95,7 +97,7 @@ class Trainer:
         if short:
             raise InputError(f"{short[0]} is shorter than a clip of {config.frames} frames")
         torch.manual_seed(config.seed)
-        self.network = GameSR(config.network()).to(self.device)
+        self.network = config.network().to(self.device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.before: list[dict[str, Any]] = []  # the runs that this one builds on, oldest first
         if config.initial_weights:
@@ -239,18 +241,18 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     return saved
 
 
-def network_of(checkpoint: dict[str, Any]) -> GameSR:
+def network_of(checkpoint: dict[str, Any]) -> Network:
     """The network in training form with a checkpoint's weights."""
-    network = GameSR(TrainConfig(**checkpoint["config"]).network())
+    network = TrainConfig(**checkpoint["config"]).network()
     network.load_state_dict(checkpoint["network"])
     return network
 
 
 @torch.no_grad()
-def psnr_y_beside_bicubic(network: GameSR, pair: Pair, frames: int) -> dict[str, float]:
-    """PSNR-Y in dB from the mean MSE of rounded luma over the first frames, for the network and its own bicubic base."""
-    device = network.stem.weight.device
-    bicubic = GameSR(replace(network.config, colour="planes", unshuffle=2, blocks=0, recurrent=False)).to(device)
+def psnr_y_beside_bicubic(network: Network, pair: Pair, frames: int) -> dict[str, float]:
+    """PSNR-Y in dB from the mean MSE of rounded luma over the first frames, for the network and for bicubic interpolation."""
+    device = network.weight.device
+    bicubic = described_network({"scale": network.scale, "blocks": 0, "recurrent": False}).to(device)  # untrained, it is that
     low, high = ([plane[:frames, None, None] for plane in take.planes()] for take in (pair.low, pair.high))
     state = network.initial_state(1, pair.low.height, pair.low.width)
     errors = np.zeros(2)

@@ -16,7 +16,7 @@ from client.errors import ModelError
 from client.frames import Frame
 from client.timing import LatencySummary
 from client.upscaler import OnnxUpscaler
-from model.network import GameSR
+from model.planes import Network
 from model.verify import Played, StepError, play
 
 SETTLED_AFTER = 100  # frames after which a state has forgotten that it began at zeros: drift is counted from here
@@ -54,7 +54,7 @@ class Subject:
 
     path: Path
     upscaler: OnnxUpscaler
-    network: GameSR | None
+    network: Network | None
     clip: Sequence[Frame]
     width: int
     height: int

@@ -17,9 +17,10 @@ from client.artifact import load_session
 from client.errors import InputError, ModelError
 from client.frames import Frame, Plane
 from client.upscaler import OnnxUpscaler, State
+from model.catalogue import described_network
 from model.export import to_codes
 from model.hard_cases import there_and_back
-from model.network import GameSR, NetworkConfig, Planes, deployed
+from model.planes import Network, Planes
 
 
 @dataclass(frozen=True)
@@ -33,19 +34,20 @@ class StepError:
     rms_state_error: float
 
 
-def network_of_artifact(artifact: Path) -> GameSR:
+def network_of_artifact(artifact: Path) -> Network:
     """The fused network in float64 with an artifact's weights; raises ModelError when it does not say what network it is."""
     _, spec = load_session(artifact, "cpu", 1)
     if "network" not in spec.card:
         raise ModelError(f"{artifact} is no network: only a trained artifact has weights to verify")
-    network = deployed(GameSR(NetworkConfig(**spec.card["network"])))
+    network = described_network(spec.card["network"]).deployed()
     weights = {
         t.name.removeprefix("network."): torch.from_numpy(numpy_helper.to_array(t).copy()) for t in onnx.load(artifact).graph.initializer
     }
-    missing = network.state_dict().keys() - weights.keys()
+    shapes = {name: weight.shape for name, weight in network.state_dict().items()}
+    missing = shapes.keys() - weights.keys()
     if missing:
         raise ModelError(f"{artifact} lacks the weights {', '.join(sorted(missing))}")
-    network.load_state_dict({name: weights[name] for name in network.state_dict()})
+    network.load_state_dict({name: weights[name].reshape(shape) for name, shape in shapes.items()})  # slopes of PReLU lie over channels
     return network.double().eval()
 
 
@@ -68,15 +70,15 @@ def crop(frame: Frame, width: int, height: int) -> Frame:
 class Reference:
     """A network in float64 on one stream, fed as the client feeds an artifact: padded to the size multiple, rounded, cropped."""
 
-    def __init__(self, network: GameSR, height: int, width: int) -> None:
-        multiple = network.config.size_multiple
+    def __init__(self, network: Network, height: int, width: int) -> None:
+        multiple = network.size_multiple
         self._network, self._multiple = network, multiple
         self._state = network.initial_state(1, -(-height // multiple) * multiple, -(-width // multiple) * multiple)
 
     @torch.no_grad()
     def step(self, frame: Frame) -> list[Plane]:
         """The upscaled planes of the next frame, uint8; raises ModelError when they are not finite."""
-        multiple, scale = self._multiple, self._network.config.scale
+        multiple, scale = self._multiple, self._network.scale
         height, width = -(-frame.height // multiple) * multiple, -(-frame.width // multiple) * multiple
         sizes = ((height, width), (height // 2, width // 2), (height // 2, width // 2))
         planes = [
@@ -108,7 +110,7 @@ class Played:
     error: StepError | None
 
 
-def play(upscaler: OnnxUpscaler, network: GameSR | None, frames: Iterable[Frame]) -> Iterator[Played]:
+def play(upscaler: OnnxUpscaler, network: Network | None, frames: Iterable[Frame]) -> Iterator[Played]:
     """Frames of one size through an artifact, as the client runs it, and through its reference, each with its own state."""
     state: State | None = None
     reference: Reference | None = None

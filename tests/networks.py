@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import torch
 
-from model.network import PRESETS, GameSR, NetworkConfig, Planes
+from model.catalogue import network_of_preset
+from model.planes import Network, Planes
 
 
-def random_network(preset: str, scale: int = 2, seed: int = 0) -> GameSR:
+def random_network(preset: str, scale: int = 2, seed: int = 0) -> Network:
     torch.manual_seed(seed)
-    network = GameSR(NetworkConfig(scale=scale, **PRESETS[preset]))
+    network = network_of_preset(preset, scale)
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.add_(0.05 * torch.randn_like(parameter))

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 
 from client import bench
@@ -79,6 +80,25 @@ def test_table_shows_every_size_scale_and_stage(monkeypatch: pytest.MonkeyPatch,
         block = lines[next(i for i, line in enumerate(lines) if line.startswith(size)) :][:17]
         assert [line.split()[:2] for line in block[1::4]] == [[name, f"x{scale}"] for scale in (2, 3) for name in ("bicubic", "lanczos")]
         assert [len(line.split()) for line in block[1:5]] == [7, 5, 5, 9]
+
+
+def test_what_a_card_says_of_the_models_size_is_shown_for_the_size_of_the_clip(
+    tmp_path: Path, clip: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(bench, "measure_in_fresh_process", measure)
+    model = onnx.load(find_model("lanczos", 2))
+    card = next(entry for entry in model.metadata_props if entry.key == "card")
+    card.value = json.dumps({"parameters": 137_860, "macs_540p": 17_934_566_400})
+    onnx.save(model, tmp_path / "sized.onnx")
+    command = ["--model", str(tmp_path / "sized.onnx"), "--clip", str(clip), "--frames", "1", "--rounds", "1"]
+    assert main(command) == 0
+    lines = capsys.readouterr().out.splitlines()
+    sized, plain = lines[-4:-1], lines[-8:-5]
+    assert sized[1].startswith("  137.9K parameters upscale") and sized[2].startswith("  0.1 GMAC          write")  # 64x48 of 960x540
+    assert [line.split()[0] for line in plain[1:]] == ["upscale", "write"]
+    assert main([*command, "--json"]) == 0
+    models = [result["model"] for result in json.loads(capsys.readouterr().out)["results"]]
+    assert [(m["parameters"], m["macs_540p"]) for m in models] == [(None, None), (None, None), (137_860, 17_934_566_400)]
 
 
 @pytest.mark.parametrize(

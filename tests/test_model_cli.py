@@ -33,6 +33,8 @@ def test_the_artifact_and_its_card_say_how_it_was_made(workshop: Path) -> None:
     page = (workshop / "tiny_x2.md").read_text()
     assert card["command"] in page
     assert "| a/four area | " in page
+    assert (card["parameters"], card["macs_540p"]) == (130_812, 16_880_140_800)
+    assert "130,812 parameters (290,172 in training), float32; 16.88 GMAC for a frame of 960x540." in page
 
 
 def test_a_card_names_the_runs_that_a_run_was_built_on(workshop: Path) -> None:
@@ -80,12 +82,15 @@ def test_evaluate_measures_each_row_once(workshop: Path, capsys: pytest.CaptureF
         ("a/five area@300", "tiny"),
     ]
     assert rows[0]["psnr_y_db"] > rows[2]["psnr_y_db"] > 10
+    assert [(row["parameters"], row["macs_540p"]) for row in rows[:2]] == [(None, None), (130_812, 16_880_140_800)]
     before = (workshop / "rows.jsonl").read_bytes()
     assert evaluate_main(command) == 0
     assert (workshop / "rows.jsonl").read_bytes() == before
     table = capsys.readouterr().out.splitlines()
     assert len(table) == 6
     assert table[2].startswith(f"| a | x2 | area | bicubic | {rows[0]['psnr_y_db']:.2f} |")
+    assert table[2].endswith(" |  |  |") and table[3].endswith(" | 130,812 | 16.9 |")
+    assert len({line.count("|") for line in table}) == 1
 
 
 def test_a_missing_folder_is_one_sentence(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:

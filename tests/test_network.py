@@ -5,7 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from model.network import PRESETS, GameSR, MergedHead, NetworkConfig, Planes, State, deployed, parameter_count
+from model.complexity import parameter_count
+from model.network import PRESETS, GameSR, MergedHead, NetworkConfig
+from model.planes import Planes, State
 from model.reparam import fuse
 from tests.networks import random_clip, random_network
 
@@ -84,7 +86,7 @@ def test_the_form_that_runs_gives_the_same_picture_to_the_border(preset: str, sc
     network = random_network(preset, scale).double()
     clip = random_clip(1, 2, 16, 24)
     before, _ = network(clip)
-    running = deployed(network)
+    running = network.deployed()
     assert isinstance(running.head, MergedHead) == (preset != "planes")
     after, _ = running(clip)
     for expected, found in zip(before, after, strict=True):

@@ -11,14 +11,15 @@ import torch
 from client.artifact import load_session
 from client.errors import ModelError
 from client.models import find_model
-from model.network import PRESETS, Planes, deployed
+from model.network import PRESETS
+from model.planes import Planes
 from model.reach import MAX_CELLS, network_reach, reach
 from tests.networks import random_network
 
 
 @pytest.mark.parametrize("preset", ["live", "planes", "planes-no-lstm", "paper-no-lstm"])
 def test_a_network_reaches_as_far_as_its_convolutions_in_a_row(preset: str) -> None:
-    network = deployed(random_network(preset)).double()
+    network = random_network(preset).deployed().double()
     config = network.config
     cells = 1 + config.blocks + config.recurrent + 1  # stem, blocks, ConvLSTM, head: each looks one cell around
     ends = 2 if config.colour == "rgb" else 0  # chroma interpolated on the way in, and a tail over the picture
@@ -26,7 +27,7 @@ def test_a_network_reaches_as_far_as_its_convolutions_in_a_row(preset: str) -> N
 
 
 def test_every_preset_has_an_end() -> None:
-    assert all(network_reach(deployed(random_network(preset)).double()) for preset in PRESETS)
+    assert all(network_reach(random_network(preset).deployed().double()) for preset in PRESETS)
 
 
 def test_an_average_over_the_picture_has_none() -> None:
