@@ -6,12 +6,33 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from client.frames import Frame
 from client.timing import Stamps
-from client.upscaler import OnnxUpscaler, State
 from client.video import Decoded
+
+
+class StreamState(Protocol):
+    """What an upscaler remembers of one stream: the size it was made for, and how the step that returned it went."""
+
+    height: int
+    width: int
+    restarted: bool
+
+    @property
+    def computed_share(self) -> float: ...
+
+
+AnyState = TypeVar("AnyState", bound=StreamState)
+
+
+class Upscaler(Protocol[AnyState]):
+    """What takes a stream's frames one after the other: `OnnxUpscaler`, or `SkippingUpscaler` around one."""
+
+    def initial_state(self, height: int, width: int) -> AnyState: ...
+
+    def step(self, frame: Frame, state: AnyState) -> tuple[Frame, AnyState]: ...
 
 
 class Sink(Protocol):
@@ -29,23 +50,27 @@ class Restart(Enum):
 
 @dataclass(frozen=True, slots=True)
 class FrameDone:
-    """One frame that went the whole way: as it was decoded, as it came out, when, and whether the state was restarted for it."""
+    """One frame that went the whole way: as it was decoded, as it came out, when, and whether the state was restarted for it.
+
+    `computed_share` is the share of its tiles that were computed, 1 where none is ever left out.
+    """
 
     pts: int | None
     stamps: Stamps
     decoded: Frame
     picture: Frame
     restart: Restart | None
+    computed_share: float
 
 
-def upscale_stream(source: Iterable[Decoded], upscaler: OnnxUpscaler, sink: Sink) -> Iterator[FrameDone]:
+def upscale_stream(source: Iterable[Decoded], upscaler: Upscaler[AnyState], sink: Sink) -> Iterator[FrameDone]:
     """Upscale every frame of `source` in order into `sink`, one at a time, the state carried from frame to frame.
 
     The state starts from zeros with the stream, and again where the picture changes size, where damage begins and where it
     ends, and where the state is lost. What the caller does between two frames is in no stage's time. Raises what source,
     upscaler and sink raise.
     """
-    state: State | None = None
+    state: AnyState | None = None
     damaged = False
     for item in source:
         frame, restart = item.frame, None
@@ -62,4 +87,4 @@ def upscale_stream(source: Iterable[Decoded], upscaler: OnnxUpscaler, sink: Sink
             restart = Restart.LOST
         sink.write(picture)
         stamps = Stamps(item.packet_ns, item.decoded_ns, upscaled_ns, time.perf_counter_ns())
-        yield FrameDone(frame.pts, stamps, frame, picture, restart)
+        yield FrameDone(frame.pts, stamps, frame, picture, restart, state.computed_share)

@@ -10,7 +10,7 @@ import onnxruntime as ort
 
 from client.artifact import ModelSpec, load_session
 from client.cores import physical_cores
-from client.errors import InputError, ModelError
+from client.errors import InputError, ModelError, ProviderError
 from client.frames import Frame, Plane
 
 MAX_OUTPUT_PIXELS = 64 * 2**20
@@ -21,10 +21,12 @@ class State:
 
     Made by `OnnxUpscaler.initial_state` for frames of `height` x `width`. `OnnxUpscaler.step` consumes it and returns the
     next one in its place; the two alternate between two sets of tensors, so nothing is allocated per frame for the state.
-    `restarted` says that the step which returned it found its state lost and began again from zeros.
+    `restarted` says that the step which returned it found its state lost and began again from zeros. Of a frame everything
+    is computed: `computed_share` is 1.
     """
 
     __slots__ = ("_buffers", "_consumed", "_current", "height", "restarted", "width")
+    computed_share = 1.0
 
     def __init__(self, buffers: _StreamBuffers, current: int, restarted: bool) -> None:
         self.height, self.width = buffers.height, buffers.width
@@ -37,6 +39,14 @@ class State:
         """A state of its own with the same content, that outlives the step which consumes this one."""
         self._check()
         return State(self._buffers.copy(self._current), 0, self.restarted)
+
+    def tensors(self) -> list[np.ndarray]:
+        """The state tensors (1, channels, H/divisor, W/divisor) in the processor's memory, of which H and W are the padded size.
+
+        What is written into them is what the next step begins with. Raises ProviderError where they lie on a device.
+        """
+        self._check()
+        return self._buffers.tensors(self._current)
 
     def _take(self) -> tuple[_StreamBuffers, int]:
         self._check()
@@ -97,7 +107,7 @@ class OnnxUpscaler:
 
     def warm_up(self, height: int, width: int) -> None:
         """Run a few grey frames, so that the first real one does not pay for allocation and first use."""
-        grey = [np.full(shape, 128, np.uint8) for shape in _plane_shapes(height, width)]
+        grey = [np.full(shape, 128, np.uint8) for shape in plane_shapes(height, width)]
         state = self.initial_state(height, width)
         for _ in range(3):
             _, state = self.step(Frame(grey[0], grey[1], grey[2]), state)
@@ -109,26 +119,23 @@ class _StreamBuffers:
     def __init__(self, session: ort.InferenceSession, spec: ModelSpec, device: str, height: int, width: int) -> None:
         self.height, self.width = height, width
         self._session, self._spec, self._device = session, spec, device
-        multiple = spec.size_multiple
-        self._padded = -(-height // multiple) * multiple, -(-width // multiple) * multiple
-        self._inputs = [np.empty((1, 1, *shape), np.uint8) for shape in _plane_shapes(*self._padded)]
+        self._padded = spec.padded(height), spec.padded(width)
+        self._inputs = [np.empty((1, 1, *shape), np.uint8) for shape in plane_shapes(*self._padded)]
         self._input_tensors = [ort.OrtValue.ortvalue_from_numpy(array) for array in self._inputs]
-        self._states = [[self._upload(zeros) for zeros in self._zeros()] for _ in range(2)]
+        self._arrays = [self._zeros() for _ in range(2)]
+        self._states = [[ort.OrtValue.ortvalue_from_numpy(array, device, 0) for array in arrays] for arrays in self._arrays]
         self._state_sum = np.zeros((), np.float32)
         self._bindings = [self._bind(current) for current in range(2)]
 
     def load(self, frame: Frame) -> None:
         """Copy the planes in, replicating the last row and column where the size does not fit the model."""
         for buffer, plane in zip(self._inputs, (frame.y, frame.u, frame.v), strict=True):
-            target, (height, width) = buffer[0, 0], plane.shape
-            target[:height, :width] = plane
-            target[:height, width:] = target[:height, width - 1 : width]
-            target[height:] = target[height - 1]
+            copy_padded(plane, buffer[0, 0])
 
     def run(self, current: int) -> tuple[list[Plane], float]:
         """Compute from state set `current` into the other; the planes are new arrays, cropped to the scaled size."""
         scale = self._spec.scale
-        outputs = [np.empty((1, 1, *shape), np.uint8) for shape in _plane_shapes(self._padded[0] * scale, self._padded[1] * scale)]
+        outputs = [np.empty((1, 1, *shape), np.uint8) for shape in plane_shapes(self._padded[0] * scale, self._padded[1] * scale)]
         binding = self._bindings[current]
         for name, tensor in zip(("y", "u", "v"), self._input_tensors, strict=True):
             binding.bind_ortvalue_input(name, tensor)  # for every frame: where the device has its own memory, binding is what copies
@@ -139,12 +146,17 @@ class _StreamBuffers:
         except Exception as error:  # the runtime's exceptions have no common base
             reason = str(error).strip().splitlines()[0]
             raise ModelError(f"model {self._spec.name} failed on a {self.width}x{self.height} frame: {reason}") from error
-        shapes = _plane_shapes(self.height * scale, self.width * scale)
+        shapes = plane_shapes(self.height * scale, self.width * scale)
         return [array[0, 0, :height, :width] for array, (height, width) in zip(outputs, shapes, strict=True)], float(self._state_sum)
 
     def clear(self, current: int) -> None:
         for tensor, zeros in zip(self._states[current], self._zeros(), strict=True):
             tensor.update_inplace(zeros)
+
+    def tensors(self, current: int) -> list[np.ndarray]:
+        if self._arrays[current] and self._device != "cpu":
+            raise ProviderError(f"the state of {self._spec.name} lies in the memory of a device, where no part of it can be replaced")
+        return self._arrays[current]  # on the CPU a tensor made from an array is that array
 
     def copy(self, current: int) -> _StreamBuffers:
         """Buffers of their own, whose state set 0 is this one's set `current`."""
@@ -157,9 +169,6 @@ class _StreamBuffers:
         height, width = self._padded
         return [np.zeros((1, s.channels, height // s.divisor, width // s.divisor), s.dtype) for s in self._spec.state]
 
-    def _upload(self, array: np.ndarray) -> ort.OrtValue:
-        return ort.OrtValue.ortvalue_from_numpy(array, self._device, 0)
-
     def _bind(self, current: int) -> ort.IOBinding:
         binding = self._session.io_binding()
         for spec, before, after in zip(self._spec.state, self._states[current], self._states[1 - current], strict=True):
@@ -170,6 +179,15 @@ class _StreamBuffers:
         return binding
 
 
-def _plane_shapes(height: int, width: int) -> tuple[tuple[int, int], tuple[int, int], tuple[int, int]]:
+def copy_padded(plane: Plane, target: Plane) -> None:
+    """Copy a plane into the upper left corner of one that is as large or larger, its last row and column replicated over the rest."""
+    height, width = plane.shape
+    target[:height, :width] = plane
+    target[:height, width:] = target[:height, width - 1 : width]
+    target[height:] = target[height - 1]
+
+
+def plane_shapes(height: int, width: int) -> tuple[tuple[int, int], tuple[int, int], tuple[int, int]]:
+    """Rows and columns of y, u and v in 4:2:0."""
     chroma = (-(-height // 2), -(-width // 2))
     return (height, width), chroma, chroma

@@ -1,0 +1,183 @@
+"""Only what changed is computed: a tile whose input stays as it was keeps its picture and its state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from client.artifact import ModelSpec
+from client.errors import ModelError
+from client.frames import Frame, Plane
+from client.tiles import Box, Mask, TileGrid, Window
+from client.upscaler import OnnxUpscaler, State, copy_padded, plane_shapes
+
+# Frames for which a recurrent network goes on with a tile that has stopped changing; docs/skipping.md says how it was measured.
+SETTLING_FRAMES = 8
+
+
+class SkippingState:
+    """What a `SkippingUpscaler` remembers of one stream; a value as `State` is one, consumed by the step that it is given to.
+
+    `computed_share` is the share of tiles that the step which returned it computed, 0 to 1.
+    """
+
+    __slots__ = ("_memory", "computed_share", "height", "restarted", "width")
+
+    def __init__(self, memory: _Memory, restarted: bool, computed_share: float) -> None:
+        self.height, self.width = memory.state.height, memory.state.width
+        self.restarted = restarted
+        self.computed_share = computed_share
+        self._memory: _Memory | None = memory
+
+    def copy(self) -> SkippingState:
+        """A state of its own with the same content, that outlives the step which consumes this one."""
+        return SkippingState(self._checked().copy(), self.restarted, self.computed_share)
+
+    def _take(self) -> _Memory:
+        memory = self._checked()
+        self._memory = None
+        return memory
+
+    def _checked(self) -> _Memory:
+        if self._memory is None:
+            raise ValueError("this state was consumed by an earlier step: pass on the one it returned, or keep a copy()")
+        return self._memory
+
+
+class SkippingUpscaler:
+    """An `OnnxUpscaler` that leaves out the tiles whose input is what they were last computed from.
+
+    A frame equal to the one before it is not computed at all. Of any other frame a tile is left out when its input, as far as the
+    model reaches around it, has not changed since it was computed: once where the model has no state, which is exact; in
+    `settling_frames` frames where it has one, whose state then stays as it is, which comes near (a state looks further around with
+    every frame). Where most of a frame changed, all of it is computed, in one run.
+
+    Raises ModelError for a model that does not say how far it reaches.
+    """
+
+    def __init__(self, upscaler: OnnxUpscaler, *, settling_frames: int = SETTLING_FRAMES) -> None:
+        if upscaler.spec.reach is None:
+            raise ModelError(
+                f"model {upscaler.spec.name} does not say how far it reaches: export it again to leave out what did not change"
+            )
+        self.spec: ModelSpec = upscaler.spec
+        self.provider, self.threads = upscaler.provider, upscaler.threads
+        self._upscaler = upscaler
+        self._reach = upscaler.spec.reach
+        self._settling_frames = settling_frames if upscaler.spec.state else 1
+
+    def initial_state(self, height: int, width: int) -> SkippingState:
+        """An empty memory for frames of `height` x `width` pixels: the first one is computed whole. Raises what `OnnxUpscaler` raises."""
+        spec = self.spec
+        state = self._upscaler.initial_state(height, width)
+        state.tensors()  # refused here where they cannot be reached, not in the middle of a stream
+        grid = TileGrid(spec.padded(height), spec.padded(width), spec.size_multiple, self._reach)
+        return SkippingState(_Memory(grid, state), restarted=False, computed_share=0.0)
+
+    def step(self, frame: Frame, state: SkippingState) -> tuple[Frame, SkippingState]:
+        """Upscale one frame, as `OnnxUpscaler.step` does and with what it raises; the planes returned are not to be written to."""
+        if (frame.height, frame.width) != (state.height, state.width):
+            raise ValueError(f"a {frame.width}x{frame.height} frame for a state of {state.width}x{state.height}")
+        memory = state._take()
+        last = memory.picture
+        changed = memory.load(frame)
+        if last is None:
+            return self._whole(frame, memory)
+        if not changed.any():
+            return self._next(replace(frame, y=last.y, u=last.u, v=last.v), memory, 0.0, False)
+        windows = memory.grid.windows(memory.ages < self._settling_frames)
+        if windows is None:
+            return self._whole(frame, memory)
+        return self._windows(frame, last, memory, windows)
+
+    def warm_up(self, height: int, width: int) -> None:
+        """Run a few grey frames, so that the first real one does not pay for allocation and first use."""
+        self._upscaler.warm_up(height, width)
+
+    def _whole(self, frame: Frame, memory: _Memory, *, restarted: bool = False) -> tuple[Frame, SkippingState]:
+        picture, memory.state = self._upscaler.step(frame, memory.state)
+        restarted = restarted or memory.state.restarted
+        memory.count(slice(None), begin_anew=restarted)
+        return self._next(picture, memory, 1.0, restarted)
+
+    def _windows(self, frame: Frame, last: Frame, memory: _Memory, windows: list[Window]) -> tuple[Frame, SkippingState]:
+        planes = [last.y.copy(), last.u.copy(), last.v.copy()]
+        computed = np.zeros(memory.grid.shape, bool)
+        states = []
+        for window in windows:
+            picture, state = self._upscaler.step(memory.cut(window.outer), self._cut_state(memory.state, window.outer))
+            if state.restarted:  # lost in one place is lost
+                memory.state = self._upscaler.initial_state(frame.height, frame.width)
+                return self._whole(frame, memory, restarted=True)
+            self._paste(picture, window, planes)
+            computed[memory.grid.tiles(window.inner)] = True
+            states.append(state)
+        for window, state in zip(windows, states, strict=True):  # only now: each window begins with the state before this frame
+            self._paste_state(state, window, memory.state)
+        memory.count(computed)
+        return self._next(replace(frame, y=planes[0], u=planes[1], v=planes[2]), memory, float(computed.mean()), False)
+
+    def _cut_state(self, state: State, outer: Box) -> State:
+        part = self._upscaler.initial_state(outer.bottom - outer.top, outer.right - outer.left)
+        for spec, target, source in zip(self.spec.state, part.tensors(), state.tensors(), strict=True):
+            target[:] = source[(..., *outer.slices(divide=spec.divisor))]
+        return part
+
+    def _paste_state(self, part: State, window: Window, state: State) -> None:
+        for spec, target, source in zip(self.spec.state, state.tensors(), part.tensors(), strict=True):
+            target[(..., *window.inner.slices(divide=spec.divisor))] = source[(..., *window.inside().slices(divide=spec.divisor))]
+
+    def _paste(self, picture: Frame, window: Window, planes: list[Plane]) -> None:
+        scale = self.spec.scale
+        for target, source, divide in zip(planes, (picture.y, picture.u, picture.v), (1, 2, 2), strict=True):
+            place = target[window.inner.slices(scale, divide)]  # ends with the picture, where the frame is padded
+            place[:] = source[window.inside().slices(scale, divide)][: place.shape[0], : place.shape[1]]
+
+    def _next(self, picture: Frame, memory: _Memory, share: float, restarted: bool) -> tuple[Frame, SkippingState]:
+        for plane in (picture.y, picture.u, picture.v):
+            plane.setflags(write=False)  # the next picture may show the same arrays
+        memory.picture = picture
+        return picture, SkippingState(memory, restarted, share)
+
+
+class _Memory:
+    """One stream: the planes of this frame and the one before, filled up to the grid, the last picture, and the tiles' ages.
+
+    `ages` holds, for each tile, in how many frames it was computed from the input that it has; up to 255.
+    """
+
+    def __init__(self, grid: TileGrid, state: State) -> None:
+        self.grid, self.state = grid, state
+        self.picture: Frame | None = None
+        self.ages = np.zeros(grid.shape, np.uint8)
+        # What no frame covers stays zero, and so never differs.
+        self._before, self._after = ([np.zeros(shape, np.uint8) for shape in grid.plane_shapes()] for _ in range(2))
+
+    def load(self, frame: Frame) -> Mask:
+        """Take a frame, padded as the model's input is; gives the tiles whose input, with the halo, differs from the last one."""
+        self._before, self._after = self._after, self._before
+        for plane, target, shape in zip(
+            (frame.y, frame.u, frame.v), self._after, plane_shapes(self.grid.height, self.grid.width), strict=True
+        ):
+            copy_padded(plane, target[: shape[0], : shape[1]])
+        changed = self.grid.changed(self._before, self._after)
+        self.ages[changed] = 0
+        return changed
+
+    def cut(self, box: Box) -> Frame:
+        """An area of the frame that was taken last."""
+        y, u, v = self._after
+        chroma = box.slices(divide=2)
+        return Frame(y[box.slices()], u[chroma], v[chroma])
+
+    def count(self, computed: Mask | slice, *, begin_anew: bool = False) -> None:
+        if begin_anew:
+            self.ages[:] = 0
+        self.ages[computed] += self.ages[computed] < 255
+
+    def copy(self) -> _Memory:
+        twin = _Memory(self.grid, self.state.copy())
+        twin.picture, twin.ages = self.picture, self.ages.copy()
+        twin._after = [plane.copy() for plane in self._after]
+        return twin
