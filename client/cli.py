@@ -22,6 +22,7 @@ from client.progress import Progress
 from client.reference import Reference
 from client.runtime import PROVIDERS
 from client.sink import FileSink
+from client.skipping import SkippingUpscaler
 from client.summary import Summary
 from client.timing import Stamps
 from client.upscaler import OnnxUpscaler
@@ -64,6 +65,11 @@ def parser() -> argparse.ArgumentParser:
         "--reference", metavar="HR", type=Path, help="the original, SCALE times as large: measure against it, frame by frame"
     )
     parser.add_argument("--compare", metavar="FILE", type=Path, help="draw bicubic against ours, as .png or .mp4")
+    parser.add_argument(
+        "--skip-unchanged",
+        action="store_true",
+        help="compute only the tiles that changed; without a state exact, else some pixels differ a little from computing all",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the summary")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
     parser.add_argument("--debug", action="store_true", help="show where an error came from")
@@ -106,6 +112,7 @@ def upscale(arguments: argparse.Namespace) -> Summary:
         _check_distinct(output, arguments)
         sink = stack.enter_context(FileSink(output, source, force=arguments.force))
         size = source.width * scale, source.height * scale
+        skipping = SkippingUpscaler(upscaler) if arguments.skip_unchanged else None
         reference = comparison = baselines = None
         if arguments.reference:
             reference = stack.enter_context(Reference(arguments.reference, *size, ("ours", "bicubic", "lanczos")))
@@ -120,9 +127,11 @@ def upscale(arguments: argparse.Namespace) -> Summary:
 
         stamps: list[Stamps] = []
         damaged_frames = state_resets = 0
+        computed_shares: list[float] = []
         progress = stack.enter_context(Progress(sys.stderr, source.estimated_frames))
-        for done in upscale_stream(source, upscaler, sink):
+        for done in upscale_stream(source, skipping, sink) if skipping else upscale_stream(source, upscaler, sink):
             stamps.append(done.stamps)
+            computed_shares.append(done.computed_share)
             damaged_frames += done.decoded.damaged
             state_resets += done.restart is not None
             if baselines:
@@ -148,6 +157,7 @@ def upscale(arguments: argparse.Namespace) -> Summary:
         decode_errors=source.decode_errors,
         damaged_frames=damaged_frames,
         state_resets=state_resets,
+        skipped_share=1 - sum(computed_shares) / len(computed_shares) if skipping else None,
         quality=quality,
         notes=notes + sink.notes,
     )

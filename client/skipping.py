@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from client.artifact import ModelSpec
-from client.errors import ModelError
+from client.errors import ModelError, ProviderError
 from client.frames import Frame, Plane
+from client.runtime import OPENVINO
 from client.tiles import Box, Mask, TileGrid, Window
 from client.upscaler import OnnxUpscaler, State, copy_padded, plane_shapes
 
 # Frames for which a recurrent network goes on with a tile that has stopped changing; docs/skipping.md says how it was measured.
-SETTLING_FRAMES = 16
+SETTLING_FRAMES = 8
 
 
 class SkippingState:
@@ -53,7 +54,8 @@ class SkippingUpscaler:
     `settling_frames` frames where it has one, whose state then stays as it is, which comes near (a state looks further around with
     every frame). Where most of a frame changed, all of it is computed, in one run.
 
-    Raises ModelError for a model that does not say how far it reaches.
+    Raises ModelError for a model that does not say how far it reaches, and ProviderError for a runtime that compiles a model for
+    every size anew: windows are of many.
     """
 
     def __init__(self, upscaler: OnnxUpscaler, *, settling_frames: int = SETTLING_FRAMES) -> None:
@@ -61,6 +63,8 @@ class SkippingUpscaler:
             raise ModelError(
                 f"model {upscaler.spec.name} does not say how far it reaches: export it again to leave out what did not change"
             )
+        if upscaler.provider in OPENVINO:
+            raise ProviderError("OpenVINO compiles a model for every size of a window: leave out what did not change with --provider cpu")
         self.spec: ModelSpec = upscaler.spec
         self.provider, self.threads = upscaler.provider, upscaler.threads
         self._upscaler = upscaler

@@ -22,7 +22,10 @@ _QUALITY_COLUMNS = {
 
 @dataclass(frozen=True)
 class Summary:
-    """Everything known after a run. Sizes are (width, height); `stamps` holds one entry for every frame, at least one."""
+    """Everything known after a run. Sizes are (width, height); `stamps` holds one entry for every frame, at least one.
+
+    `skipped_share` is the share of all tiles of all frames that were not computed; None where skipping was not asked for.
+    """
 
     input: Path
     output: Path
@@ -35,6 +38,7 @@ class Summary:
     decode_errors: int
     damaged_frames: int
     state_resets: int
+    skipped_share: float | None = None
     quality: Mapping[str, Quality] = field(default_factory=dict)
     notes: Sequence[str] = ()
 
@@ -50,6 +54,7 @@ class Summary:
             "decode_errors": self.decode_errors,
             "damaged_frames": self.damaged_frames,
             "state_resets": self.state_resets,
+            "skipped_share": self.skipped_share,
             "input": {"path": str(self.input), "width": self.input_size[0], "height": self.input_size[1]},
             "output": {"path": str(self.output), "width": self.output_size[0], "height": self.output_size[1]},
             "model": {
@@ -79,6 +84,8 @@ class Summary:
         if self.decode_errors or self.damaged_frames or self.state_resets:
             resets = f"{self.damaged_frames} frames damaged, {self.state_resets} state resets"
             lines.append(f"  trouble  {self.decode_errors} packets not decoded, {resets}")
+        if self.skipped_share is not None:
+            lines.append(f"  skipped  {100 * self.skipped_share:.1f}% of the tiles, which had not changed")
         lines.append(f"  {'latency, ms':<12}" + "".join(f"{head:>10}" for head in ("p50", "p95", "p99", "max")))
         for stage, latency in stage_latencies(self.stamps).items():
             values = (latency.p50, latency.p95, latency.p99, latency.max)

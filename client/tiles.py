@@ -14,6 +14,7 @@ GRAIN = 8  # luma pixels: a change is found in squares of this size, which are e
 MIN_TILE = 32
 # What a window costs beside its area, in luma pixels of the input: measured from 1,000 (a network) to 6,000 (bicubic).
 WINDOW_PIXELS = 4096
+WORTH_IT = 0.875  # of a whole frame's cost: above it, copying the picture that stays takes what is saved
 MAX_PIECES = 64  # more than that are not worth the time that joining them takes
 
 Mask = NDArray[np.bool_]
@@ -86,7 +87,7 @@ class TileGrid:
         if due.all() or len(pieces) > MAX_PIECES:
             return None
         boxes = self._joined(pieces)
-        if int(self._cost(boxes).sum()) >= self.height * self.width + WINDOW_PIXELS:
+        if self._cost(boxes).sum() > WORTH_IT * (self.height * self.width + WINDOW_PIXELS):
             return None
         inner, outer = self._pixels(boxes, 0), self._pixels(boxes, self.halo)
         return [Window(Box(*a), Box(*b)) for a, b in zip(inner.tolist(), outer.tolist(), strict=True)]

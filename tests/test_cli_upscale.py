@@ -116,6 +116,21 @@ def test_a_baseline_takes_the_networks_place(make_clip: MakeClip, capsys: pytest
     assert next(read_frames(clip.with_name("clip_gamesr_x3.mp4"))).y.shape == (3 * HEIGHT, 3 * WIDTH)
 
 
+def test_skipping_is_said_and_changes_nothing_without_a_state(make_clip: MakeClip, capsys: pytest.CaptureFixture[str]) -> None:
+    still = next(read_frames(make_clip()))
+    clip = make_clip("still.mp4", pictures=[still] * FRAMES, options={"qp": "20", "g": "100"})
+    output = clip.with_name("still_gamesr_x2.mp4")
+    contents, records = [], []
+    for options in ([], ["--skip-unchanged"]):
+        assert cli.main([str(clip), "--model", "bicubic", "--json", "--force", *options]) == 0
+        contents.append(output.read_bytes())
+        records.append(json.loads(capsys.readouterr().out))
+    assert contents[0] == contents[1]
+    assert records[0]["skipped_share"] is None and 0.5 < records[1]["skipped_share"] < 1
+    assert cli.main([str(clip), "--model", "bicubic", "--force", "--skip-unchanged"]) == 0
+    assert "% of the tiles" in capsys.readouterr().out
+
+
 def test_existing_output_needs_force(make_clip: MakeClip, tiny: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     clip, output = make_clip(), tmp_path / "out.mp4"
     output.write_text("mine")
