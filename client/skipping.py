@@ -59,12 +59,12 @@ class SkippingUpscaler:
     """
 
     def __init__(self, upscaler: OnnxUpscaler, *, settling_frames: int = SETTLING_FRAMES) -> None:
+        if upscaler.provider in OPENVINO:
+            raise ProviderError("OpenVINO compiles a model for every size of a window: leave out what did not change with --provider cpu")
         if upscaler.spec.reach is None:
             raise ModelError(
                 f"model {upscaler.spec.name} does not say how far it reaches: export it again to leave out what did not change"
             )
-        if upscaler.provider in OPENVINO:
-            raise ProviderError("OpenVINO compiles a model for every size of a window: leave out what did not change with --provider cpu")
         self.spec: ModelSpec = upscaler.spec
         self.provider, self.threads = upscaler.provider, upscaler.threads
         self._upscaler = upscaler

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from client.artifact import PROVIDERS
 from client.cloud import CloudSettings, area_downscale
 from client.errors import GamesrError, InputError
 from client.frames import Frame
 from client.models import DEFAULT_MODEL, find_model
 from client.pipeline import upscale_stream
 from client.quality import psnr_db, squared_error
+from client.runtime import PROVIDERS
 from client.sink import NullSink
 from client.skipping import SkippingUpscaler
 from client.upscaler import OnnxUpscaler
@@ -202,7 +202,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--model", metavar="NAME|FILE", default=DEFAULT_MODEL, help="a shipped x2 model or a file (default: %(default)s)")
     parser.add_argument("--frames", metavar="N", type=_frame_count, default=60, help="frames of each clip to use (default: %(default)s)")
     parser.add_argument("--kbps", metavar="N", type=int, default=6000, help="bitrate of CBR and intra-refresh (default: %(default)s)")
-    parser.add_argument("--provider", choices=tuple(PROVIDERS), default="cpu", help="what runs the model (default: %(default)s)")
+    parser.add_argument("--provider", choices=PROVIDERS, default="cpu", help="what runs the model (default: %(default)s)")
     parser.add_argument("--threads", metavar="N", type=int, help="threads of the model (default: the physical cores)")
     parser.add_argument("--json", action="store_true", help="print one JSON object a row instead of the table")
     parser.add_argument("--debug", action="store_true", help="show where an error came from")
