@@ -26,8 +26,8 @@ class Content:
 
     idr: bool
     parameters: bool  # holds a sequence parameter set
-    headed: bool  # begins with a delimiter or a sequence parameter set: nothing can be missing in front
-    opens: bool  # begins with the first slice: nothing but parameter sets can be missing in front
+    headed: bool  # begins with a delimiter, or has a sequence parameter set before any slice: no slice is missing in front
+    opens: bool  # has the first slice: nothing but parameter sets can be missing in front
     reference: bool
     recovery_frames: int | None
 
@@ -195,24 +195,19 @@ def parameter_sets(data: bytes) -> list[bytes]:
 def inspect(data: bytes) -> Content:
     """What the NAL units of an Annex B access unit say."""
     kinds: list[int] = []
-    opens = reference = False
+    headed = opens = reference = sliced = False
     recovery: int | None = None
     for unit in nal_units(data):
         kind = unit[0] & 0x1F
         kinds.append(kind)
         if kind in (_SLICE, _IDR_SLICE):
-            reference = unit[0] & 0x60 != 0
-            opens |= len(kinds) == 1 and unit[1:2] >= b"\x80"  # first_mb_in_slice is 0, coded as one set bit
+            if not sliced:
+                opens = unit[1:2] >= b"\x80"  # first_mb_in_slice is 0, coded as one set bit
+                headed = kinds[0] == _DELIMITER or _SPS in kinds
+            sliced, reference = True, unit[0] & 0x60 != 0
         elif kind == _SEI and recovery is None:
             recovery = recovery_point(unit[1:])
-    return Content(
-        idr=_IDR_SLICE in kinds,
-        parameters=_SPS in kinds,
-        headed=kinds[:1] in ([_SPS], [_DELIMITER]),
-        opens=opens,
-        reference=reference,
-        recovery_frames=recovery,
-    )
+    return Content(_IDR_SLICE in kinds, _SPS in kinds, headed, opens, reference, recovery)
 
 
 def recovery_point(sei: bytes) -> int | None:

@@ -38,6 +38,16 @@ class ReceptionCounts:
     keyframe_requests: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    """A packet that may be the first of a new stream."""
+
+    address: Address
+    packet: RtpPacket
+    size: int
+    arrived_ns: int
+
+
 class Reception:
     """Follows one sender: its packets in order, its pictures whole as soon as their marker bit is there, judged by the loss rule.
 
@@ -64,7 +74,7 @@ class Reception:
         self._own_ssrc = secrets.randbits(32)
         self._ssrc: int | None = None
         self._newest = 0  # sequence number, unwrapped
-        self._candidate: tuple[Address, RtpPacket, int] | None = None
+        self._candidate: _Candidate | None = None
         self._order: ReorderBuffer[tuple[RtpPacket, int]] = ReorderBuffer(0)
         self._assembler = Assembler(wall_offset_ns, parameters_known)
         self._rule = LossRule(parameters_known)
@@ -93,11 +103,10 @@ class Reception:
         if packet is None or packet.payload_type != self._payload_type:
             self._counts.ignored += 1
             return []
-        self._counts.bytes += len(datagram)
         number = unwrap(packet.sequence_number, self._newest, 16)
         if (address, packet.ssrc) == (self.sender, self._ssrc) and -_MAX_MISORDER < number - self._newest < _MAX_DROPOUT:
-            return self._accept(number, packet, now_ns)
-        return self._consider(packet, address, now_ns)
+            return self._accept(number, packet, len(datagram), now_ns)
+        return self._consider(packet, len(datagram), address, now_ns)
 
     def release(self, now_ns: int) -> list[AccessUnit]:
         """What time alone completes: packets that waited long enough for a missing one."""
@@ -137,31 +146,33 @@ class Reception:
         elif any(isinstance(packet, RtcpByePacket) and self._ssrc in packet.sources for packet in parse_rtcp(datagram)):
             self.ended = True
 
-    def _accept(self, number: int, packet: RtpPacket, now_ns: int) -> list[AccessUnit]:
+    def _accept(self, number: int, packet: RtpPacket, size: int, now_ns: int) -> list[AccessUnit]:
         self._counts.packets += 1
+        self._counts.bytes += size
         self.heard_ns = now_ns
         self._newest = max(self._newest, number)
         self._candidate = None
         return self._assemble(self._order.push(number, (packet, now_ns), now_ns), now_ns)
 
-    def _consider(self, packet: RtpPacket, address: Address, now_ns: int) -> list[AccessUnit]:
+    def _consider(self, packet: RtpPacket, size: int, address: Address, now_ns: int) -> list[AccessUnit]:
         """A packet that is not of the locked stream: two in sequence make a new one, and both are kept."""
         if self.sender is not None and address != self.sender and now_ns - self.heard_ns < SILENCE_NS:
             self._counts.ignored += 1
             return []
-        before, self._candidate = self._candidate, (address, packet, now_ns)
-        if before is None or before[0] != address or before[1].ssrc != packet.ssrc:
+        before, self._candidate = self._candidate, _Candidate(address, packet, size, now_ns)
+        if before is None or before.address != address or before.packet.ssrc != packet.ssrc:
             return []
-        first = before[1].sequence_number
+        first = before.packet.sequence_number
         if packet.sequence_number != (first + 1) & 0xFFFF:
             return []
         self.sender, self._ssrc, self.ended = address, packet.ssrc, False
         self._newest = first
-        self._counts = self.counts  # what the old order buffer counted
+        self._counts = self.counts  # with what the old order counted
         self._order = ReorderBuffer(first)
-        self._assembler.restart(before[1], now_ns)
+        self._assembler.restart(before.packet, now_ns)
         self._counts.senders += 1
-        return self._accept(first, before[1], before[2]) + self._accept(first + 1, packet, now_ns)
+        units = self._accept(first, before.packet, before.size, before.arrived_ns)
+        return units + self._accept(first + 1, packet, size, now_ns)
 
     def _assemble(self, passed: list[tuple[int, tuple[RtpPacket, int]]], now_ns: int) -> list[AccessUnit]:
         units = []
