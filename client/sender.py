@@ -158,7 +158,8 @@ class RtpSender:
         except ConnectionRefusedError:
             return len(datagram)  # nobody listens yet
         except OSError as error:
-            raise OutputError(f"cannot send to {self._target[0]} port {self._target[1]}: {error.strerror}") from error
+            host, port = self.target
+            raise OutputError(f"cannot send to {host} port {port}: {error.strerror}") from error
 
 
 def packetise(data: bytes) -> list[bytes]:

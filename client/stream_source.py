@@ -117,6 +117,7 @@ class EncodedFile:
                 raise InputError(f"{self._path} holds no H.264: leave out --copy to have it encoded")
             annex_b = BitStreamFilterContext("h264_mp4toannexb", stream)
             period = Fraction(1, self._fps) if self._fps else 1 / Fraction(stream.guessed_rate or 30)
+            tick = stream.time_base or Fraction(1, CLOCK_HZ)
             first_dts: int | None = None
             index = 0
             for packet in container.demux(stream):
@@ -126,8 +127,8 @@ class EncodedFile:
                     decode_at = show_at = index * period
                     if self._fps is None and filtered.dts is not None and filtered.pts is not None:
                         first_dts = filtered.dts if first_dts is None else first_dts
-                        decode_at = (filtered.dts - first_dts) * stream.time_base
-                        show_at = (filtered.pts - first_dts) * stream.time_base
+                        decode_at = (filtered.dts - first_dts) * tick
+                        show_at = (filtered.pts - first_dts) * tick
                     elif filtered.pts != filtered.dts:
                         raise InputError(f"the pictures of {self._path} are not in order (B-frames): leave out --fps")
                     yield decode_at, show_at, bytes(filtered)
