@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import av
 import pytest
 
-from client.cloud import NetworkSettings
+from client.cloud import CloudEncoder, NetworkSettings
+from client.frames import Frame
+from client.live import LiveDecoder
+from client.reception import Reception
+from client.rtp import CLOCK_HZ
+from client.sender import RtpStream, Unit
+from client.video import from_av_frame
 from tests.lossy import Weather
-from tests.streaming import CALM, FPS, IDR, INTRA, WIDTH, Played, play
+from tests.streaming import CALM, FPS, HEIGHT, IDR, INTRA, SENDER, WIDTH, Played, planes, play, scene
 
 WIDTH_IN_BLOCKS = WIDTH // 16
 MODES = pytest.mark.parametrize("settings", [IDR, INTRA], ids=["idr", "intra-refresh"])
@@ -119,3 +126,29 @@ def test_frame_num_wraps_inside_a_loss() -> None:
     check(played)
     gaps = [b.index - a.index for a, b in zip(played.shown, played.shown[1:], strict=False)]
     assert max(gaps) < 12 and played.idrs  # a refresh alone would not have brought one
+
+
+@pytest.mark.parametrize("restart", [False, True], ids=["same-sender", "sender-restarts"])
+def test_another_size_in_mid_stream(restart: bool) -> None:
+    """As a server adapts: every picture of both sizes comes out at once and to the bit."""
+    stream, reception, decoder = RtpStream(), Reception(wall_offset_ns=0), LiveDecoder()
+    reference = av.CodecContext.create("h264", "r")
+    reference.thread_count = 1
+    got, want, now_ns, index = [], [], 0, 0
+    for width, height in ((WIDTH, HEIGHT), (WIDTH // 2, HEIGHT // 2), (WIDTH, HEIGHT)):
+        encoder = CloudEncoder(IDR, width, height)
+        stream = RtpStream() if restart else stream
+        for _ in range(10):
+            full = scene(index)
+            crop = Frame(full.y[:height, :width], full.u[: height // 2, : width // 2], full.v[: height // 2, : width // 2])
+            data = b"".join(encoder.encode(crop))
+            want += [planes(from_av_frame(picture)) for picture in reference.decode(av.Packet(data))]
+            for datagram in stream.datagrams(Unit(data, index * CLOCK_HZ // FPS), lambda: 0):
+                now_ns += 1_000_000
+                got += [item for unit in reception.take(datagram, SENDER, now_ns) for item in decoder.decode(unit)]
+            index += 1
+    assert [planes(item.frame) for item in got] == want and len(want) == 30
+    assert not any(item.frame.damaged for item in got)
+    assert reception.counts.senders == (3 if restart else 1)
+    stamps = [item.frame.pts or 0 for item in got]
+    assert stamps == sorted(set(stamps))
