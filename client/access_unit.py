@@ -71,6 +71,7 @@ class Assembler:
         self._shift = 0  # keeps timestamps rising over a restart
         self._restarted = True
         self._lost = 0  # since the last unit
+        self._gap = False  # directly before the next packet that is no padding
         self._unit: _Unit | None = None
 
     def restart(self, packet: RtpPacket, now_ns: int) -> None:
@@ -79,7 +80,7 @@ class Assembler:
         if self._newest_ns is not None:
             continued += max(1, (now_ns - self._newest_ns) * 9 // 100_000)
         self._timestamp, self._shift = packet.timestamp, continued - packet.timestamp
-        self._restarted, self._lost, self._unit = True, 0, None
+        self._restarted, self._lost, self._gap, self._unit = True, 0, False, None
 
     def skip(self, units: int) -> None:
         """Units were thrown away behind this one's back: what comes next follows a loss."""
@@ -88,6 +89,7 @@ class Assembler:
     def add(self, packet: RtpPacket, arrived_ns: int, missing: int) -> Iterator[AccessUnit]:
         """Take the next packet, `missing` ones after the last."""
         self._lost += missing
+        self._gap |= missing > 0
         if missing and self._unit is not None:
             self._unit.broken = True
             self._unit.drop_fragment()
@@ -101,7 +103,8 @@ class Assembler:
             sent, sent_ns = packet.extensions.abs_send_time, None
             if sent is not None:
                 sent_ns = arrived_ns - transit_ns(sent, arrived_ns + self._wall_offset_ns)
-            self._unit = _Unit(arrived_ns, sent_ns, after_gap=missing > 0 or self._restarted)
+            self._unit = _Unit(arrived_ns, sent_ns, after_gap=self._gap or self._lost > 0 or self._restarted)
+        self._gap = False
         unit = self._unit
         unit.last_ns = arrived_ns
         unit.packets += 1

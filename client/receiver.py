@@ -57,13 +57,13 @@ class RtpReceiver:
         self._socket.close()
 
     def next_unit(self, timeout_s: float) -> AccessUnit | None:
-        """The next access unit, or None where none came in time, or none will (see `ended`)."""
+        """The next access unit, or None where none came in time."""
         with self._changed:
-            self._changed.wait_for(lambda: self._units or self._over(), timeout_s)
+            self._changed.wait_for(lambda: self._units or self._closed, timeout_s)
             return self._units.popleft() if self._units else None
 
     def request_keyframe(self) -> None:
-        """Ask the sender for an IDR: the decoder cannot go on by itself. Rate-limited; sent with the next packet that comes."""
+        """Ask the sender for an IDR: the decoder cannot go on by itself. At most ten a second are sent."""
         with self._changed:
             self._reception.want_keyframe()
 
@@ -71,7 +71,7 @@ class RtpReceiver:
     def ended(self) -> bool:
         """The sender said goodbye, or the receiver was closed, and every unit has been taken."""
         with self._changed:
-            return self._over() and not self._units
+            return (self._closed or self._reception.ended) and not self._units
 
     @property
     def silent_ns(self) -> int | None:
@@ -88,9 +88,6 @@ class RtpReceiver:
     def counts(self) -> ReceptionCounts:
         with self._changed:
             return self._reception.counts
-
-    def _over(self) -> bool:
-        return self._closed or self._reception.ended
 
     def _run(self) -> None:
         while not self._closed:
@@ -111,13 +108,13 @@ class RtpReceiver:
         with self._changed:
             reception = self._reception
             units = [] if address is None else reception.take(datagram, address[:2], now_ns)
-            for unit in (units := units + reception.release(now_ns)):
-                if len(self._units) >= UNITS_QUEUED:
-                    reception.lose(len(self._units) + 1)
-                    self._units.clear()
-                else:
-                    self._units.append(unit)
-            if units or reception.ended:
+            units += reception.release(now_ns)
+            if len(self._units) + len(units) > UNITS_QUEUED:
+                reception.lose(len(self._units) + len(units))  # the new ones too: they were judged before this loss
+                self._units.clear()
+            else:
+                self._units += units
+            if units:
                 self._changed.notify_all()
             feedback, sender = reception.feedback(now_ns), reception.sender
         if feedback is not None and sender is not None:

@@ -52,7 +52,7 @@ class Reception:
     """Follows one sender: its packets in order, its pictures whole as soon as their marker bit is there, judged by the loss rule.
 
     It locks to the first address and SSRC that sends two packets in sequence (RFC 3550, A.1), and ignores others until that
-    one has been silent for a second. From the same address, two packets in sequence with another SSRC, or far away in
+    one has said goodbye or been silent for a second. From the same address, two packets in sequence with another SSRC, or far away in
     sequence, are a sender that was started again. Every buffer is bounded; nothing that is received raises.
 
     All times are `time.perf_counter_ns()`, given by the caller.
@@ -156,7 +156,8 @@ class Reception:
 
     def _consider(self, packet: RtpPacket, size: int, address: Address, now_ns: int) -> list[AccessUnit]:
         """A packet that is not of the locked stream: two in sequence make a new one, and both are kept."""
-        if self.sender is not None and address != self.sender and now_ns - self.heard_ns < SILENCE_NS:
+        present = self.sender is not None and not self.ended and now_ns - self.heard_ns < SILENCE_NS
+        if present and address != self.sender:
             self._counts.ignored += 1
             return []
         before, self._candidate = self._candidate, _Candidate(address, packet, size, now_ns)

@@ -50,12 +50,11 @@ class UnitSource(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """A unit that was sent: its bytes on the wire and packets, how late it was, and whether the receiver had asked for an IDR."""
+    """A unit that was sent: its bytes on the wire, its packets, and how late it was."""
 
     bytes: int
     packets: int
     late_ns: int
-    requested: bool
 
 
 class RtpStream:
@@ -96,8 +95,8 @@ class RtpStream:
 class RtpSender:
     """Sends access units to one receiver and reads its RTCP on the same socket; a context manager.
 
-    A sender report goes out once a second, a BYE at the end.
-    Raises InputError where the host has no address, OutputError where packets cannot be sent.
+    A sender report goes out once a second, a BYE at the end. Raises InputError where the host has no address, OutputError where
+    packets cannot be sent.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -178,15 +177,14 @@ def stream(source: UnitSource, sender: RtpSender) -> Iterator[Sent]:
     begin_ns = time.perf_counter_ns()
     wanted, answered_ns, before_ns = False, 0, 0
     while (due_ns := source.due_ns()) is not None:
-        asked = sender.listen(begin_ns + due_ns)
+        wanted |= sender.listen(begin_ns + due_ns)
         now_ns = time.perf_counter_ns()
         late_ns = now_ns - begin_ns - due_ns
         if late_ns > due_ns - before_ns > 0:
             begin_ns += late_ns
         before_ns = due_ns
-        wanted |= asked
         idr = wanted and source.answers_requests and now_ns - answered_ns >= IDR_INTERVAL_NS
         if idr:
             wanted, answered_ns = False, now_ns
         packets, sent = sender.send(source.take(idr=idr))
-        yield Sent(sent, packets, late_ns, asked)
+        yield Sent(sent, packets, late_ns)

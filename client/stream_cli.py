@@ -59,6 +59,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         return send(arguments)
+    except KeyboardInterrupt:
+        print(f"{PROGRAM}: interrupted before anything was sent", file=sys.stderr)
+        return 130
     except GamesrError as error:
         if arguments.debug:
             traceback.print_exc()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -18,10 +19,11 @@ from client import stream_cli
 from client.cloud import NetworkSettings
 from client.errors import InputError
 from client.live import LiveDecoder, Received, live_frames
+from client.loss import LossRule
 from client.pipeline import Restart, upscale_stream
 from client.receiver import UNITS_QUEUED, RtpReceiver
 from client.sdp import LOOPBACK, Session, read_sdp
-from client.sender import RtpSender, Unit, stream
+from client.sender import RtpSender, RtpStream, Unit, stream
 from client.sink import NullSink
 from client.stream_source import EncodedFile, EncodedLive
 from client.upscaler import OnnxUpscaler
@@ -115,6 +117,25 @@ def test_who_takes_nothing_loses_everything_but_no_memory(receiver: RtpReceiver)
         sender.send(Unit(unit(999, 5, slices=1), 999 * 1500))
         last = receiver.next_unit(LONG_S)
         assert last is not None and not last.damaged  # an IDR ends this damage as any other
+
+
+def test_a_queue_that_overflows_damages_what_follows(receiver: RtpReceiver) -> None:
+    """Even where several units are completed by one packet, which closed a gap."""
+    outgoing = RtpStream()
+    sent = [
+        d for n in range(UNITS_QUEUED + 8) for d in outgoing.datagrams(Unit(unit(n, 5 if n == 0 else 1, slices=1), n * 1500), time.time_ns)
+    ]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
+        for datagram in [*sent[:60], *sent[61:70], sent[60], *sent[70:]]:
+            wire.sendto(datagram, receiver.address)
+        end = time.monotonic() + LONG_S
+        while receiver.counts.packets < len(sent) and time.monotonic() < end:
+            time.sleep(0.01)
+    left = []
+    while (got := receiver.next_unit(0.05)) is not None:
+        left.append(got)
+    rule = LossRule()
+    assert receiver.counts.overflowed_units and left and all(got.damaged and rule.admit(got) for got in left)
 
 
 def test_silence_is_told(receiver: RtpReceiver) -> None:

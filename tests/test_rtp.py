@@ -170,6 +170,16 @@ def test_an_idr_behind_a_gap_counts_only_where_nothing_can_be_missing_in_front_o
         assert [whole.damaged for whole in units] == [False, True, not clean]
 
 
+def test_padding_does_not_hide_the_gap_in_front_of_it() -> None:
+    """Of an IDR's three packets the first is lost and the second, in this case, only pads."""
+    stream, reception = RtpStream(), Reception(wall_offset_ns=0)
+    sent = packets(stream, 0, 5) + packets(stream, 1) + packets(stream, 2, 5)
+    padding = parse_rtp(sent[7], extensions_map(None))
+    assert padding is not None
+    padding.payload, padding.padding_size = b"", 4
+    assert [whole.damaged for whole in heard(reception, [*sent[:6], padding.serialize(), sent[8]])] == [False, False, True]
+
+
 def test_requests_are_few_and_go_to_the_stream() -> None:
     stream, reception = RtpStream(), Reception(wall_offset_ns=0)
     requests = []
