@@ -9,9 +9,12 @@ from fractions import Fraction
 import av
 import numpy as np
 from av.video.codeccontext import VideoCodecContext
+from av.video.frame import PictureType
 
 from client.frames import BT709_LIMITED, ColourTags, Frame, Plane
 from client.video import from_av_frame, to_av_frame
+
+SLICE_BYTES = 1200  # with IP, UDP, RTP and a header extension below every path's MTU of today
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,24 @@ def _round_divide(total: np.ndarray, count: int) -> Plane:
     return ((total + count // 2) // count).astype(np.uint8)
 
 
+@dataclass(frozen=True)
+class NetworkSettings(CloudSettings):
+    """How it encodes for a network that loses: no frame larger than its share of the bitrate, every slice in one packet.
+
+    With `intra_refresh` a column of intra blocks wanders over the picture twice a second, announced by recovery points;
+    without it there is an IDR every `idr_interval_s` seconds. Either way an IDR comes when it is asked for.
+    """
+
+    vbv_frames: int = 1
+    intra_refresh: bool = False
+    idr_interval_s: int = 4
+
+    def x264_params(self) -> str:
+        keyint = max(2, self.fps // 2) if self.intra_refresh else self.fps * self.idr_interval_s
+        # The last of two equal keys counts. slice-max-size has no effect with sliced threads.
+        return f"{super().x264_params()}:keyint={keyint}:min-keyint=1:slice-max-size={SLICE_BYTES}:intra-refresh={int(self.intra_refresh)}"
+
+
 class CloudEncoder:
     """Frames in, H.264 packets out; nothing is held back (zerolatency, no B-frames)."""
 
@@ -82,12 +103,19 @@ class CloudEncoder:
         context.framerate = Fraction(settings.fps)
         context.color_range, context.colorspace = colour.range, colour.matrix
         context.color_primaries, context.color_trc = colour.primaries, colour.transfer
-        context.options = {"preset": settings.preset, "tune": "zerolatency", "x264-params": settings.x264_params()}
+        context.options = {
+            "preset": settings.preset,
+            "tune": "zerolatency",
+            "forced-idr": "1",
+            "x264-params": settings.x264_params(),
+        }
         self._context = context
         self._index = 0
 
-    def encode(self, frame: Frame) -> list[bytes]:
+    def encode(self, frame: Frame, *, idr: bool = False) -> list[bytes]:
         picture = to_av_frame(frame)
+        if idr:
+            picture.pict_type = PictureType.I
         picture.pts, picture.time_base = self._index, self._context.time_base
         self._index += 1
         return [bytes(packet) for packet in self._context.encode(picture)]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-RUNTIME = {"numpy", "av", "onnxruntime", "imageio_ffmpeg"}
+RUNTIME = {"numpy", "av", "onnxruntime", "imageio_ffmpeg", "aiortc"}
 WORKSHOP = {"torch", "onnx", "tqdm"}
 HARNESS = {"distributed", "bjontegaard", "matplotlib"}
 SERVICE = {"fastapi", "starlette", "pydantic", "uvicorn", "prometheus_client", "anyio"}

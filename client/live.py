@@ -1,0 +1,117 @@
+"""Access units to frames: the decoder of a live stream, which outlives what a network does to it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+
+import av
+from av.codec.context import Flags, ThreadType
+from av.video.codeccontext import VideoCodecContext
+
+from client.access_unit import AccessUnit
+from client.errors import InputError
+from client.loss import LossRule
+from client.receiver import RtpReceiver
+from client.rtp import CLOCK_HZ
+from client.video import MAX_SIDE, Decoded, from_av_frame
+
+_TIME_BASE = Fraction(1, CLOCK_HZ)
+_UNITS_KEPT = 32  # twice what H.264 may reorder
+_IDLE_S = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Received(Decoded):
+    """A decoded frame with the access unit that it came in; `pts` is the unit's timestamp, `packet_ns` when it was decoded."""
+
+    unit: AccessUnit
+
+
+class LiveDecoder:
+    """Decodes each access unit as it is given; a frame is marked damaged as the loss rule says, or as the decoder itself does.
+
+    Nothing is decoded before the stream's first IDR or recovery point. What cannot be decoded, or not be shown, is counted in
+    `decode_errors`, the reason kept in `refusal`, and taken for a loss. `stuck` says that pictures no longer come out: libavcodec
+    holds them back when whole frames are lost just where frame_num wraps, until an IDR comes.
+    """
+
+    def __init__(self, parameter_sets: bytes = b"") -> None:
+        self.decode_errors = 0
+        self.refusal: str | None = None
+        self.stuck = False
+        self._parameter_sets = parameter_sets
+        self._rule = LossRule(bool(parameter_sets))
+        self._context = _open_decoder()
+        self._fresh = True
+        self._waiting: dict[int, tuple[AccessUnit, bool]] = {}
+        self._delay: int | None = None  # units that wait after a picture came out: the stream's own reordering
+
+    def decode(self, unit: AccessUnit) -> list[Received]:
+        """The frames that this unit completes: its own, unless the stream reorders."""
+        damaged = self._rule.admit(unit)
+        if unit.restarted:
+            self._context, self._fresh, self._delay = _open_decoder(), True, None
+            self._waiting.clear()
+        if not self._rule.begun or not unit.data:
+            return []
+        packet = av.Packet(self._parameter_sets + unit.data if self._fresh else unit.data)
+        self._fresh = False
+        packet.pts, packet.time_base = unit.timestamp, _TIME_BASE
+        self._waiting[unit.timestamp] = unit, damaged
+        if len(self._waiting) > _UNITS_KEPT:
+            del self._waiting[next(iter(self._waiting))]
+        packet_ns = time.perf_counter_ns()
+        try:
+            pictures = self._context.decode(packet)
+            frames = [received for picture in pictures if (received := self._receive(picture, packet_ns))]
+        except (av.FFmpegError, InputError) as error:
+            self._distrust(error)
+            return []
+        self.stuck = not frames and self._delay is not None and len(self._waiting) > self._delay + 1
+        return frames
+
+    def _receive(self, picture: av.VideoFrame, packet_ns: int) -> Received | None:
+        decoded_ns = time.perf_counter_ns()
+        if picture.interlaced_frame:
+            raise InputError("the stream is interlaced, which is not supported")
+        if picture.pts not in self._waiting:
+            return None
+        unit, damaged = self._waiting.pop(picture.pts)
+        for timestamp in [timestamp for timestamp in self._waiting if timestamp < picture.pts]:
+            del self._waiting[timestamp]  # pictures come in order: these never will
+        if self._delay is None:
+            self._delay = len(self._waiting)
+        if picture.is_corrupt and not damaged:
+            self._rule.distrust()
+        return Received(from_av_frame(picture, damaged=damaged), packet_ns, decoded_ns, unit)
+
+    def _distrust(self, error: Exception) -> None:
+        self.decode_errors += 1
+        self.refusal = str(error)
+        self._rule.distrust()
+
+
+def live_frames(receiver: RtpReceiver, decoder: LiveDecoder, idle: Callable[[], None]) -> Iterator[Received]:
+    """The frames of a receiver until its sender says goodbye, each as soon as it is decoded; `idle` is called while none comes."""
+    while not receiver.ended:
+        unit = receiver.next_unit(_IDLE_S)
+        if unit is None:
+            idle()
+            continue
+        errors = decoder.decode_errors
+        yield from decoder.decode(unit)
+        if decoder.stuck or decoder.decode_errors > errors:
+            receiver.request_keyframe()
+
+
+def _open_decoder() -> VideoCodecContext:
+    """As for files: sliced threads and low_delay. Pictures that the decoder knows to be wrong come out too: they are marked."""
+    context = av.CodecContext.create("h264", "r")
+    assert isinstance(context, VideoCodecContext)
+    context.thread_type = ThreadType.SLICE
+    context.flags |= Flags.low_delay | Flags.output_corrupt
+    context.options = {"max_pixels": str(MAX_SIDE * MAX_SIDE)}
+    return context

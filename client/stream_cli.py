@@ -1,0 +1,153 @@
+"""gamesr-stream: the cloud's end of a game stream, to play against."""
+
+from __future__ import annotations
+
+import argparse
+import secrets
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+
+from client.cloud import NetworkSettings
+from client.errors import GamesrError, OutputError
+from client.video import VideoSource
+
+PROGRAM = "gamesr-stream"
+EXAMPLES = """\
+examples:
+  gamesr-stream match_1080p.mp4 --to 127.0.0.1:5004 --height 540 --bitrate 8M --loop
+      encodes as a game server does and sends over and over, until Ctrl-C
+  gamesr-stream match_540p.mp4 --to 127.0.0.1:5004 --copy
+      sends a file's H.264 as it is: no encoder takes the cores of a player that is measured on the same machine
+  gamesr-stream match_1080p.mp4 --to 192.0.2.7:5004 --height 540 --bitrate 8M --intra-refresh --sdp stream.sdp
+      also writes the description that ffplay, ffmpeg and GStreamer read
+
+The stream is RTP (RFC 3550, RFC 6184) and says goodbye at its end. A key frame that the receiver asks for (RTCP PLI) comes
+with the next picture; --copy has only those of the file. Exit status: 0 done, 1 refused or failed, 2 wrong usage, 130
+interrupted.
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM,
+        description="Stream a clip over RTP in real time, encoded as a cloud-gaming server encodes.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("clip", metavar="CLIP", type=Path, help="the video that stands for the game")
+    parser.add_argument("--to", metavar="HOST:PORT", type=_address, required=True, help="who receives it")
+    parser.add_argument("--height", metavar="N", type=_positive, help="reduce the picture to this height, a whole part of the clip's")
+    parser.add_argument("--bitrate", metavar="RATE", type=_kbps, help="such as 8M or 4500k (default: 8M)")
+    parser.add_argument("--fps", metavar="N", type=_positive, help="pictures a second (default: the clip's)")
+    parser.add_argument("--intra-refresh", action="store_true", help="a wandering column of intra blocks instead of IDRs")
+    parser.add_argument("--copy", action="store_true", help="send the clip's own H.264, not encoded again")
+    parser.add_argument("--loop", action="store_true", help="begin again at the end")
+    parser.add_argument("--sdp", metavar="FILE", type=Path, help="write the session description for other receivers")
+    parser.add_argument("--force", action="store_true", help="replace the description if it exists")
+    parser.add_argument("--debug", action="store_true", help="show where an error came from")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit status."""
+    arguments = parser().parse_args(argv)
+    if arguments.copy and (arguments.height or arguments.bitrate or arguments.intra_refresh):
+        parser().error("--copy sends what is there: --height, --bitrate and --intra-refresh are for encoding")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return send(arguments)
+    except KeyboardInterrupt:
+        print(f"{PROGRAM}: interrupted before anything was sent", file=sys.stderr)
+        return 130
+    except GamesrError as error:
+        if arguments.debug:
+            traceback.print_exc()
+        return _fail(str(error))
+    except ModuleNotFoundError as error:
+        if error.name != "aiortc":
+            raise
+        return _fail("streaming needs the extra `play`: pip install 'gamesr[play]'")
+
+
+def send(arguments: argparse.Namespace) -> int:
+    """Everything between the arguments and the summary. Raises GamesrError."""
+    from client.sdp import write_sdp  # these need the extra `play`
+    from client.sender import RtpSender, Sent, UnitSource, stream
+    from client.stream_source import EncodedFile, EncodedLive
+
+    with VideoSource(arguments.clip) as clip:
+        fps = arguments.fps or max(1, round(clip.frame_rate))
+        height = arguments.height or clip.height
+    source: UnitSource
+    if arguments.copy:
+        source = EncodedFile(arguments.clip, arguments.fps, loop=arguments.loop)
+    else:
+        settings = NetworkSettings(arguments.bitrate or 8000, fps, intra_refresh=arguments.intra_refresh)
+        source = EncodedLive(arguments.clip, height, settings, loop=arguments.loop)
+    host, port = arguments.to
+    sent: list[Sent] = []
+    status = 0
+    with RtpSender(host, port) as sender:
+        if arguments.sdp:
+            _write(arguments.sdp, write_sdp(*sender.target, source.parameter_sets(), fps), force=arguments.force)
+        try:
+            for done in stream(source, sender):
+                sent.append(done)
+        except KeyboardInterrupt:
+            status = 130
+    period_ms = 1000 / fps
+    late = sum(done.late_ns / 1e6 > period_ms for done in sent)
+    kbps = sum(done.bytes for done in sent) * 8 / 1000 / max(1, len(sent)) * fps
+    print(
+        f"{len(sent)} pictures in {sum(done.packets for done in sent)} packets, {kbps:.0f} kbit/s on the wire; "
+        f"{late} late by more than {period_ms:.1f} ms; {sender.requests} key frame requests"
+        f"{'' if source.answers_requests or not sender.requests else ', not answered: --copy has only those of the file'}",
+        flush=True,
+    )
+    return status
+
+
+def _write(path: Path, text: str, *, force: bool) -> None:
+    """Whole or not at all; raises OutputError."""
+    if path.exists() and not force:
+        raise OutputError(f"{path} exists: use --force to replace it")
+    partial = path.with_name(f".{path.name[:64]}.{secrets.token_hex(4)}.part")
+    try:
+        partial.write_bytes(text.encode())
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, colon, port = text.rpartition(":")
+    if not colon or not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise argparse.ArgumentTypeError(f"{text} is not HOST:PORT")
+    return host.strip("[]"), int(port)
+
+
+def _kbps(text: str) -> int:
+    number, unit = text[:-1], text[-1:].lower()
+    try:
+        kbps = round(float(number) * {"k": 1, "m": 1000}[unit])
+    except (KeyError, ValueError, OverflowError) as error:
+        raise argparse.ArgumentTypeError(f"{text} is not a bitrate such as 8M or 4500k") from error
+    if not 1 <= kbps <= 1_000_000:
+        raise argparse.ArgumentTypeError(f"{text} is not between 1k and 1000M")
+    return kbps
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if not 1 <= number <= 8192:
+        raise argparse.ArgumentTypeError(f"{text} is not between 1 and 8192")
+    return number
+
+
+def _fail(sentence: str) -> int:
+    print(f"{PROGRAM}: {sentence}", file=sys.stderr)
+    return 1
