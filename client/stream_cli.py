@@ -56,7 +56,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(argv)
     if arguments.copy and (arguments.height or arguments.bitrate or arguments.intra_refresh):
         parser().error("--copy sends what is there: --height, --bitrate and --intra-refresh are for encoding")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for signum in (signal.SIGINT, signal.SIGTERM):  # also where a shell that started it in the background has it ignore the first
+        signal.signal(signum, signal.default_int_handler)
     try:
         return send(arguments)
     except KeyboardInterrupt:

@@ -188,9 +188,12 @@ def test_the_command(make_clip: MakeClip, receiver: RtpReceiver, tmp_path: Path)
     arguments = [str(clip), "--to", f"{LOOPBACK}:{receiver.address[1]}", "--height", "48", "--bitrate", "500k", "--loop", "--sdp", str(sdp)]
     program = [sys.executable, "-c", "import sys; from client.stream_cli import main; sys.exit(main())", *arguments]
     with subprocess.Popen(program, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": str(Path.cwd())}) as process:
-        units = [receiver.next_unit(LONG_S) for _ in range(2 * FRAMES + 3)]
-        process.send_signal(signal.SIGINT)
-        said = process.communicate(timeout=LONG_S)[0]
+        try:
+            units = [receiver.next_unit(LONG_S) for _ in range(2 * FRAMES + 3)]
+            process.send_signal(signal.SIGINT)
+            said = process.communicate(timeout=LONG_S)[0]
+        finally:
+            process.kill()
     assert process.returncode == 130 and " pictures in " in said and "kbit/s" in said
     assert all(got is not None and not got.damaged for got in units)
     assert [got.timestamp for got in units if got] == [3000 * n for n in range(2 * FRAMES + 3)]
