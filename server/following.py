@@ -9,6 +9,8 @@ import sys
 import threading
 from types import FrameType
 
+_AGAIN_S = 0.01
+
 
 def end_with_parent() -> None:
     """For the first line of a process: SIGTERM, and the parent's end, leave it as an exception, so that contexts are left too."""
@@ -18,6 +20,12 @@ def end_with_parent() -> None:
 
 
 def _leave(signum: int, frame: FrameType | None) -> None:
+    below = frame
+    while below is not None:
+        if below.f_code.co_name == "__del__":  # an exception would be lost in it: a moment later, then
+            threading.Timer(_AGAIN_S, os.kill, (os.getpid(), signum)).start()
+            return
+        below = below.f_back
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not stop what the first one began to put away
     sys.exit(128 + signum)
 
