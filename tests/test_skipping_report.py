@@ -43,7 +43,7 @@ def test_a_row_counts_what_was_skipped_and_bicubic_loses_nothing() -> None:
 
 def test_the_command_prints_a_row_a_scene(make_clip: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
     clip = make_clip(pictures=FRAMES, width=144, height=96)
-    arguments = [str(clip), "--model", "bicubic", "--frames", "8", "--kbps", "500", "--threads", "1"]
+    arguments = [str(clip), "--model", "bicubic", "--frames", "8", "--kbps", "500"]
     assert main(arguments) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2 + len(ROWS) and len({line.count("|") for line in lines}) == 1
@@ -58,6 +58,15 @@ def test_a_clip_that_does_not_fit_is_refused(
 ) -> None:
     clip = make_clip(width=size[0], height=size[1], frames=frames)
     assert main([str(clip), "--model", "bicubic"]) == 1
-    assert capsys.readouterr().err == (
+    captured = capsys.readouterr()
+    assert captured.out == ""  # no head of a table that will not come
+    assert captured.err == (
         f"gamesr-skipping: {clip} has {frames} frames of {size[0]}x{size[1]}: this needs 8, with sides that are multiples of 4\n"
     )
+
+
+def test_a_bitrate_that_is_none_is_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["clip.mp4", "--kbps", "-1"])
+    assert ended.value.code == 2
+    assert "-1 is not between 1 and 1000000" in capsys.readouterr().err

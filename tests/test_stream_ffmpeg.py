@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import imageio_ffmpeg
 import pytest
 
 from client.errors import GamesrError
@@ -21,7 +22,6 @@ from client.stream_source import EncodedFile
 from client.video import read_frames
 from tests.streaming import planes
 
-imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 MakeClip = Callable[..., Path]
 LONG_S = 60.0
 SIZE = {"frames": 24, "width": 320, "height": 192}  # IDRs of many packets
@@ -30,10 +30,7 @@ OPTIONS = {"bf": "0", "g": "8", "crf": "12"}
 
 @pytest.fixture
 def ffmpeg() -> str:
-    try:
-        return str(imageio_ffmpeg.get_ffmpeg_exe())
-    except RuntimeError:
-        pytest.skip("imageio-ffmpeg finds no ffmpeg program")
+    return str(imageio_ffmpeg.get_ffmpeg_exe())
 
 
 @contextlib.contextmanager
