@@ -1,14 +1,12 @@
-"""Filmed scenes: what a game's file says, what is kept, and whether a folder still holds what was filmed. No game is needed."""
+"""Filmed scenes: what is kept, and whether a folder still holds what was filmed. No game is needed."""
 
 from __future__ import annotations
 
 import shutil
 import sys
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 
@@ -18,127 +16,14 @@ from client.video import read_frames
 from model.capture.checking import EMPTY, MARGIN_DB, alignment, liveliness
 from model.capture.cli import main
 from model.capture.filming import Shot
-from model.capture.games import GAMES, SPLITS, SceneSpec, choose, load_games
-from model.capture.library import X264_OPTIONS, Library, film_to_file
+from model.capture.games import SceneSpec, load_games
+from model.capture.library import Library, film_to_file
 from model.capture.rendering import shots_of
 from model.footage import Degradation, FootageCache, load_pairs, load_scenes
+from tests.capturing import EXCERPT, excerpt, write_clip, write_game
 
-EXCERPT = Path(__file__).parent / "footage" / "capture"
 WORLD = (0.0, 0.0, 1.0, 1.0)
 HEIGHTS = (216, 108, 72)
-
-
-def excerpt(height: int) -> Path:
-    return EXCERPT / f"oa_dm5_{height}p.mkv"
-
-
-def write_clip(path: Path, lumas: list[np.ndarray]) -> Path:
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=60, options=dict(X264_OPTIONS))
-        stream.height, stream.width = lumas[0].shape
-        stream.pix_fmt = "yuv420p"
-        for luma in lumas:
-            half = np.full((luma.shape[0] // 2, luma.shape[1]), 128, np.uint8)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.vstack([luma, half]), "yuv420p")))
-        container.mux(stream.encode(None))
-    return path
-
-
-# ---- what ships ----
-
-
-def test_the_games_that_ship_split_by_scene_into_enough_of_each() -> None:
-    scenes = load_games()
-    assert len({scene.title for scene in scenes}) == len(scenes) >= 30
-    assert sum(scene.frames for scene in scenes) >= 5000
-    for game in ("openarena", "supertuxkart"):
-        assert {scene.split for scene in choose(scenes, [game])} == set(SPLITS)
-    assert {scene.split for scene in scenes if scene.antialiased} == set(SPLITS)
-
-
-def test_every_scene_that_plays_a_demo_has_one_and_all_of_them_are_small() -> None:
-    demos = [scene.demo for scene in load_games() if scene.demo is not None]
-    assert demos and all(demo.is_file() for demo in demos)
-    assert sum(demo.stat().st_size for demo in demos) < 4 * 2**20
-
-
-def test_every_word_of_every_scene_is_known() -> None:
-    for scene in load_games():
-        for run in (scene.game.play, scene.game.record):
-            for text in (*run.command, *run.files, *run.files.values(), *run.environment.values()) if run else ():
-                scene.fill(text, {"width": 1, "height": 1, "home": "/"})
-
-
-def test_a_game_ships_whole() -> None:
-    packages = tomllib.loads((GAMES.parents[2] / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["model.capture"]
-    shipped = {path for pattern in packages for path in GAMES.parent.glob(pattern)}
-    assert {path for path in GAMES.parent.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")} == shipped
-
-
-# ---- a game's file ----
-
-
-def write_game(folder: Path, **changes: str) -> Path:
-    keys = {"title": '"Test"', "fps": "60", "process": '"python3"', "packages": "[]", "licence": '"none"', "repeatable": "true"}
-    keys |= {"native": "true", "world": "[0, 0, 1, 1]", "skip": "0", "frames": "40", "colour": '"red"'} | changes
-    folder.mkdir(exist_ok=True)
-    lines = [f"{key} = {value}" for key, value in keys.items()]
-    lines += ["[play]", 'command = ["game", "$name", "$colour"]', "[[scene]]", 'name = "one"', 'split = "train"']
-    lines += ["[[scene]]", 'name = "two"', 'split = "test"', 'colour = "blue"', "antialiased = true"]
-    (folder / "test.toml").write_text("\n".join(lines))
-    return folder
-
-
-def test_a_scene_says_of_itself_what_its_game_does_not(tmp_path: Path) -> None:
-    one, two = load_games(write_game(tmp_path))
-    assert (one.title, one.split, one.fill("$colour", {})) == ("test/one", "train", "red")
-    assert (two.title, two.split, two.fill("$colour", {})) == ("test/two", "test", "blue")
-    assert [shot.name for shot in shots_of(one, [108, 216])] == ["216p", "108p"]
-    assert [shot.name for shot in shots_of(two, [108, 216])] == ["216p", "108p", "216p_aa"]
-    assert [shot.name for shot in shots_of(replace(two, native=False), [108, 216])] == ["216p", "216p_aa"]
-
-
-def test_what_is_filmed_decides_the_digest_and_nothing_else(tmp_path: Path) -> None:
-    def digests(**changes: str) -> list[str]:
-        return [scene.digest() for scene in load_games(write_game(tmp_path, **changes))]
-
-    one, two = digests()
-    assert one != two
-    assert digests(title='"Other"', licence='"some"', packages='["x"]') == [one, two]
-    assert digests(colour='"green"') == [digests(colour='"green"')[0], two] != [one, two]
-    for change in ({"frames": "41"}, {"skip": "1"}, {"fps": "30"}):
-        assert not {one, two} & set(digests(**change))
-
-
-@pytest.mark.parametrize(
-    "changes", [{"fps": '"many"'}, {"world": "[0, 0, 1]"}, {"world": "[0, 0.5, 1, 0.4]"}, {"frames": "[]"}, {"title": "unquoted"}]
-)
-def test_a_game_file_that_is_wrong_is_named(tmp_path: Path, changes: dict[str, str]) -> None:
-    with pytest.raises(InputError, match=r"test\.toml is not a game file"):
-        load_games(write_game(tmp_path, **changes))
-
-
-@pytest.mark.parametrize("name", ["../climb", "a b", "", "/etc"])
-def test_a_scene_has_a_plain_name(tmp_path: Path, name: str) -> None:
-    text = (write_game(tmp_path) / "test.toml").read_text().replace('"one"', f'"{name}"')
-    (tmp_path / "test.toml").write_text(text)
-    with pytest.raises(InputError, match="not a plain name"):
-        load_games(tmp_path)
-
-
-def test_a_map_cannot_be_in_two_splits(tmp_path: Path) -> None:
-    text = (write_game(tmp_path) / "test.toml").read_text().replace('"two"', '"one"')
-    (tmp_path / "test.toml").write_text(text)
-    with pytest.raises(InputError, match="names a scene twice"):
-        load_games(tmp_path)
-
-
-def test_scenes_are_chosen_by_game_name_and_split(tmp_path: Path) -> None:
-    scenes = load_games(write_game(tmp_path))
-    assert [s.name for s in choose(scenes, [])] == [s.name for s in choose(scenes, ["test/two", "train"])] == ["one", "two"]
-    assert [s.name for s in choose(scenes, ["test/two"])] == ["two"]
-    with pytest.raises(InputError, match="no game, scene or split 'one'"):
-        choose(scenes, ["one"])
 
 
 # ---- the checks, on a real excerpt ----
