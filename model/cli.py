@@ -220,6 +220,7 @@ def evaluate_main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--scales", nargs="+", type=int, choices=(2, 3), default=[2, 3])
     parser.add_argument("--degradations", nargs="+", default=["area", "area@8000", "area@4000"], metavar="HOW")
     parser.add_argument("--frames", type=int, default=60, help="of each scene, from its start (default: %(default)s)")
+    parser.add_argument("--provider", choices=PROVIDERS, default="cpu", help="what runs the models (default: %(default)s)")
     parser.add_argument("--threads", type=int, help="threads of the network (default: the physical cores)")
     parser.add_argument("--rows", type=Path, default=Path("runs/evaluation.jsonl"), help="measured rows, kept (default: %(default)s)")
     parser.add_argument("--cache", type=Path, default=Path("runs/cache"), help="decoded footage, may be deleted (default: %(default)s)")
@@ -238,6 +239,7 @@ def evaluate_main(argv: Sequence[str] | None = None) -> int:
             scales=arguments.scales,
             degradations=degradations,
             frames=arguments.frames,
+            provider=arguments.provider,
             threads=arguments.threads,
             store=arguments.rows,
         )

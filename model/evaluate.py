@@ -19,6 +19,7 @@ from client.video import Decoded
 from model.footage import Degradation, FootageCache, Pair, Scene, load_pairs
 
 Row = dict[str, Any]
+_KEY = ("clip", "scale", "model", "sha256", "frames", "provider")
 
 
 def evaluate(
@@ -29,23 +30,25 @@ def evaluate(
     scales: Sequence[int],
     degradations: Sequence[Degradation],
     frames: int,
+    provider: str = "cpu",
     threads: int | None,
     store: Path,
 ) -> Iterator[Row]:
     """Every combination as a row of figures; rows already in `store` (JSON lines) are read from it, new ones appended.
 
     Speed is not measured here but by gamesr-bench, so rows may be made while something else runs. A row is known by clip,
-    scale, number of frames and the artifact's digest; what its card says of parameters and multiply-accumulates stands in the
-    row too. Raises what reading footage and models raises.
+    scale, number of frames, provider and the artifact's digest; what its card says of parameters and multiply-accumulates stands
+    in the row too. Raises what reading footage and models raises.
     """
     known = _read_rows(store)
     for scale in scales:
-        upscalers = [OnnxUpscaler(find_model(name, scale), threads=threads) for name in models]
+        upscalers = [OnnxUpscaler(find_model(name, scale), provider=provider, threads=threads) for name in models]
         for takes in load_pairs(scenes, cache, scale, degradations):
             for pair in takes:
                 for upscaler in upscalers:
                     spec = upscaler.spec
-                    key = {"clip": pair.title, "scale": scale, "model": spec.name, "sha256": spec.sha256, "frames": min(frames, len(pair))}
+                    values = pair.title, scale, spec.name, spec.sha256, min(frames, len(pair)), provider
+                    key = dict(zip(_KEY, values, strict=True))
                     row = known.get(json.dumps(key))
                     if row is None:
                         row = {**key, **_measure(pair, upscaler, frames)}
@@ -73,7 +76,7 @@ def _read_rows(store: Path) -> dict[str, Row]:
         for line in store.read_text().splitlines():
             try:
                 row = json.loads(line)
-                rows[json.dumps({k: row[k] for k in ("clip", "scale", "model", "sha256", "frames")})] = row
+                rows[json.dumps({k: row[k] for k in _KEY})] = row
             except (ValueError, KeyError) as error:
                 raise InputError(f"{store} is not a file of rows made by gamesr-evaluate: {error}") from error
     return rows

@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 RUNTIME = {"numpy", "av", "onnxruntime", "imageio_ffmpeg", "aiortc"}
-WORKSHOP = {"torch", "onnx", "tqdm"}
+WORKSHOP = {"torch", "onnx", "tqdm", "matplotlib"}
 HARNESS = {"distributed", "bjontegaard", "matplotlib"}
 SERVICE = {"fastapi", "starlette", "pydantic", "uvicorn", "prometheus_client", "anyio"}
 

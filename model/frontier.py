@@ -1,0 +1,259 @@
+"""gamesr-frontier: milliseconds a frame against decibels over bicubic, of models on runtimes, all measured side by side."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from pathlib import Path
+from statistics import fmean, median
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter
+from tqdm import tqdm
+
+from client.errors import GamesrError
+from client.measurement import WARM_UP_FRAMES, Task, measure_in_fresh_process
+from client.models import find_model
+from client.runtime import PROVIDERS
+from client.synthetic import write_synthetic_clip
+from model.evaluate import Row, evaluate
+from model.footage import Degradation, FootageCache, load_scenes
+
+PROGRAM = "gamesr-frontier"
+EPILOG = """\
+example:
+  gamesr-frontier footage.toml --models bicubic lanczos live gamesr --providers cpu openvino-bfloat16 --svg frontier.svg
+
+how it is measured:
+  Quality is that of gamesr-evaluate, on the test scenes, by every runtime itself; rows are kept. Time is that of gamesr-bench:
+  upscaling one frame of a made clip, 960x540 by 2 or 640x360 by 3, every run in a fresh process, models and runtimes in turn in
+  every round, p50 and p95 as medians over the rounds. Over bicubic: dB of PSNR-Y above bicubic on the same runtime, mean over a
+  game's scenes. Worst plane: the least that any of Y, U and V gains or loses over bicubic in any game. A model on a runtime is on the
+  frontier of an input when nothing that is as fast (p95) gains more PSNR-Y, games counted alike.
+
+Exit status: 0 done, 1 refused or failed (one sentence says why), 2 wrong usage, 130 interrupted.
+"""
+YARDSTICK = "bicubic"
+PLANES = ("psnr_y_db", "psnr_u_db", "psnr_v_db")
+
+
+@dataclass(frozen=True)
+class Gains:
+    """What a model on a runtime gains over bicubic on one input; `psnr_y_db` by game. VMAF-NEG is a mean, not a difference."""
+
+    psnr_y_db: dict[str, float]
+    worst_plane_db: float
+    vmaf_neg: float | None
+    on_frontier: bool = False
+
+    @property
+    def mean_db(self) -> float:
+        return fmean(self.psnr_y_db.values())
+
+
+@dataclass
+class Candidate:
+    """A model on a runtime: milliseconds of upscaling one frame, and gains by input."""
+
+    model: str
+    provider: str
+    parameters: int | None
+    macs_540p: int | None
+    p50_ms: float
+    p95_ms: float
+    gains: dict[str, Gains]
+
+    @property
+    def title(self) -> str:
+        return self.model if self.provider == "cpu" else f"{self.model}, {self.provider}"
+
+
+def gains_over_bicubic(rows: Sequence[Row]) -> dict[str, dict[str, Gains]]:
+    """By input, then by model, from rows of one runtime that hold bicubic too."""
+    groups: dict[tuple[str, str, str], list[Row]] = {}
+    for row in rows:
+        title, degradation = row["clip"].split()
+        groups.setdefault((degradation, row["model"], title.split("/")[0]), []).append(row)
+    gains: dict[str, dict[str, Gains]] = {}
+    for degradation, model in dict.fromkeys((degradation, model) for degradation, model, _ in groups):
+        over: dict[str, list[float]] = {}
+        vmaf_neg: list[float | None] = []
+        for (_, _, game), own in [(key, group) for key, group in groups.items() if key[:2] == (degradation, model)]:
+            base = groups[degradation, YARDSTICK, game]
+            over[game] = [fmean(row[plane] for row in own) - fmean(row[plane] for row in base) for plane in PLANES]
+            vmaf_neg += [row["vmaf_neg"] for row in own]
+        known = [value for value in vmaf_neg if value is not None]
+        gains.setdefault(degradation, {})[model] = Gains(
+            {game: planes[0] for game, planes in over.items()},
+            min(min(planes) for planes in over.values()),
+            fmean(known) if len(known) == len(vmaf_neg) else None,
+        )
+    return gains
+
+
+def frontier(points: Sequence[tuple[float, float]]) -> list[bool]:
+    """Which points (cost, gain) no other beats: none is as cheap or cheaper and gains more, or cheaper and gains as much."""
+    return [not any((c <= cost and g > gain) or (c < cost and g >= gain) for c, g in points) for cost, gain in points]
+
+
+def table(candidates: Sequence[Candidate], degradation: str) -> str:
+    """Markdown for one input, fastest first; what is on the frontier is bold."""
+    games = list(candidates[0].gains[degradation].psnr_y_db)
+    heads = ["model", "runtime", "parameters", "GMAC, 540p", "ms p50", "p95", *games, "worst plane", "VMAF-NEG"]
+    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+    for candidate in sorted(candidates, key=lambda c: c.p95_ms):
+        gains = candidate.gains[degradation]
+        cells = [
+            f"**{candidate.model}**" if gains.on_frontier else candidate.model,
+            candidate.provider,
+            "" if candidate.parameters is None else f"{candidate.parameters:,}",
+            "" if candidate.macs_540p is None else f"{candidate.macs_540p / 1e9:.1f}",
+            f"{candidate.p50_ms:.1f}",
+            f"{candidate.p95_ms:.1f}",
+            *(f"{gains.psnr_y_db[game]:+.2f}" for game in games),
+            f"{gains.worst_plane_db:+.2f}",
+            "undefined" if gains.vmaf_neg is None else f"{gains.vmaf_neg:.1f}",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def drawing(candidates: Sequence[Candidate]) -> bytes:
+    """SVG: a panel an input, p95 against the mean gain, the frontier as a line, one frame of 60 fps as another; repeatable."""
+    inputs = list(candidates[0].gains)
+    with mpl.rc_context(
+        {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "svg.hashsalt": "gamesr", "svg.fonttype": "none"}
+    ):
+        figure = Figure(figsize=(5.2 * len(inputs), 4.2), layout="constrained")
+        for number, degradation in enumerate(inputs):
+            axis = figure.add_subplot(1, len(inputs), number + 1)
+            points = sorted((c.p95_ms, c.gains[degradation].mean_db, c) for c in candidates)
+            best = [(ms, db) for ms, db, c in points if c.gains[degradation].on_frontier]
+            axis.step(*zip(*best, strict=True), where="post", color="#0072B2", linewidth=1.2)
+            for ms, db, candidate in points:
+                on = candidate.gains[degradation].on_frontier
+                axis.plot(ms, db, "o", color="#0072B2" if on else "#767676", markersize=5)
+                axis.annotate(candidate.title, (ms, db), xytext=(4, 4), textcoords="offset points", fontsize=7)
+            axis.axvline(1000 / 60, color="#D55E00", linewidth=1, linestyle=(0, (4, 2)))
+            axis.axhline(0, color="#767676", linewidth=0.6)
+            axis.set_xscale("log")
+            axis.margins(x=0.18, y=0.1)
+            axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axis.xaxis.set_minor_formatter(NullFormatter())
+            axis.set_title(f"input {degradation}", loc="left", fontweight="bold", fontsize=10)
+            axis.set_xlabel("upscaling one frame, p95 ms (dashed: one frame of 60 fps)")
+            axis.set_ylabel("PSNR-Y over bicubic, dB, mean over games")
+        target = io.BytesIO()
+        figure.savefig(target, format="svg", metadata={"Date": None})
+    return target.getvalue()
+
+
+def measure(arguments: argparse.Namespace) -> list[Candidate]:
+    """Every model on every runtime; raises GamesrError."""
+    names = list(dict.fromkeys([YARDSTICK, *arguments.models]))
+    latencies = _latencies(names, arguments)
+    candidates = []
+    for provider in arguments.providers:
+        rows = list(tqdm(_rows(names, provider, arguments), desc=provider, unit="row", disable=not sys.stderr.isatty()))
+        gains = gains_over_bicubic(rows)
+        for model in dict.fromkeys(row["model"] for row in rows):
+            row = next(row for row in rows if row["model"] == model)
+            p50_ms, p95_ms = latencies[provider, model]
+            of_model = {degradation: by_model[model] for degradation, by_model in gains.items()}
+            candidates.append(Candidate(model, provider, row["parameters"], row["macs_540p"], p50_ms, p95_ms, of_model))
+    for degradation in candidates[0].gains:
+        best = frontier([(c.p95_ms, c.gains[degradation].mean_db) for c in candidates])
+        for candidate, on_frontier in zip(candidates, best, strict=True):
+            candidate.gains[degradation] = replace(candidate.gains[degradation], on_frontier=on_frontier)
+    return candidates
+
+
+def _latencies(names: Sequence[str], arguments: argparse.Namespace) -> dict[tuple[str, str], tuple[float, float]]:
+    """p50 and p95 of upscaling in ms by (runtime, model's own name), medians over rounds in which all take turns."""
+    size = (960, 540) if arguments.scale == 2 else (640, 360)
+    runs: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    with tempfile.TemporaryDirectory(prefix="gamesr-frontier-") as folder:
+        clip = Path(folder) / "clip.h264"
+        write_synthetic_clip(clip, *size, WARM_UP_FRAMES + arguments.timed_frames)
+        turns = list(product(range(arguments.rounds), names, arguments.providers))
+        for _, name, provider in tqdm(turns, desc="timing", unit="run", disable=not sys.stderr.isatty()):
+            run = measure_in_fresh_process(
+                Task(find_model(name, arguments.scale), clip, arguments.timed_frames, provider, arguments.threads)
+            )
+            latency = run.latency_us["upscale"]
+            runs.setdefault((provider, run.spec.name), []).append((latency.p50 / 1000, latency.p95 / 1000))
+    return {key: (median(p50 for p50, _ in of), median(p95 for _, p95 in of)) for key, of in runs.items()}
+
+
+def _rows(names: Sequence[str], provider: str, arguments: argparse.Namespace) -> Iterator[Row]:
+    arguments.rows.parent.mkdir(parents=True, exist_ok=True)
+    return evaluate(
+        load_scenes(arguments.footage, split="test", games=[]),
+        FootageCache(arguments.cache),
+        models=names,
+        scales=[arguments.scale],
+        degradations=[Degradation.parse(text) for text in arguments.degradations],
+        frames=arguments.frames,
+        provider=provider,
+        threads=arguments.threads,
+        store=arguments.rows,
+    )
+
+
+def parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM,
+        description="Milliseconds against decibels: which models on which runtimes no other beats.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("footage", type=Path, help="the footage list, a TOML file; its test scenes are used")
+    parser.add_argument("--models", nargs="+", default=["lanczos", "live", "gamesr"], metavar="NAME|FILE", help="beside bicubic")
+    parser.add_argument("--providers", nargs="+", choices=PROVIDERS, default=["cpu"], help="runtimes (default: cpu)")
+    parser.add_argument("--scale", type=int, choices=(2, 3), default=2)
+    parser.add_argument("--degradations", nargs="+", default=["area", "area@8000"], metavar="HOW", help="inputs (default: %(default)s)")
+    parser.add_argument("--frames", type=int, default=24, help="of each scene, from its start (default: %(default)s)")
+    parser.add_argument("--timed-frames", type=int, default=30, help="frames of a timed run (default: %(default)s)")
+    parser.add_argument("--rounds", type=int, default=5, help="timed runs of each (default: %(default)s)")
+    parser.add_argument("--threads", type=int, help="threads of the models (default: the physical cores)")
+    parser.add_argument("--rows", type=Path, default=Path("runs/evaluation.jsonl"), help="measured rows, kept (default: %(default)s)")
+    parser.add_argument("--cache", type=Path, default=Path("runs/cache"), help="decoded footage, may be deleted (default: %(default)s)")
+    parser.add_argument("--svg", type=Path, metavar="FILE", help="draw it")
+    parser.add_argument("--json", action="store_true", help="a JSON line for each model on each runtime instead of the tables")
+    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit status."""
+    arguments = parser().parse_args(argv)
+    try:
+        candidates = measure(arguments)
+        if arguments.svg:
+            partial = arguments.svg.with_name(f".{arguments.svg.name}.{os.getpid()}.part")
+            partial.write_bytes(drawing(candidates))
+            partial.replace(arguments.svg)
+    except GamesrError as error:
+        if arguments.debug:
+            raise
+        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        return 1
+    except OSError as error:
+        print(f"{PROGRAM}: {error.filename or 'file'}: {error.strerror}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f"{PROGRAM}: stopped; the same command goes on from the rows in {arguments.rows}", file=sys.stderr)
+        return 130
+    for candidate in candidates if arguments.json else ():
+        print(json.dumps(asdict(candidate)))
+    for degradation in () if arguments.json else candidates[0].gains:
+        print(f"Input {degradation}:\n\n{table(candidates, degradation)}\n")
+    return 0
