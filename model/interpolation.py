@@ -104,7 +104,8 @@ class LearnedInterpolation(Interpolation):
     """Interpolation whose kernel training may bend, by `reach` cells around, without ever changing a flat area.
 
     The linear part of super-resolution is a sharpening filter; learned here it costs nothing at run time, since the
-    interpolation is a convolution anyway. The correction is centred per output pixel, so every kernel still sums to one.
+    interpolation is a convolution anyway. The correction is centred per output pixel, so every kernel still sums to one. A kernel
+    that reaches further than `reach` is cut there and normalized again.
     """
 
     GAIN = 0.1  # a step of the optimizer then moves the picture by a tenth of what it moves the parameter
@@ -113,6 +114,7 @@ class LearnedInterpolation(Interpolation):
         super().__init__(kernel, scale, block, shift)
         grow = reach - self.weight.shape[2] // 2
         self.weight = F.pad(self.weight, (grow,) * 4)
+        self.weight /= self.weight.sum((1, 2, 3), keepdim=True)
         self.pad = [block * reach] * 4
         self.correction = nn.Parameter(torch.zeros(self.weight.shape, dtype=torch.get_default_dtype()))
 

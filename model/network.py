@@ -26,8 +26,8 @@ class NetworkConfig:
 
     `unshuffle` is PixelUnshuffle's factor (1: none); an input's height and width are multiples of `size_multiple`.
     `learned_base` lets training bend the bicubic kernel under the residual, and `skip` adds the ConvLSTM's input to its
-    output, so that detail need not pass through gates that saturate; both are ours, not the paper's. `lean` has ReLU for
-    GELU and no LayerNorm, which take longer than the convolutions where those run in bfloat16 or int8.
+    output, so that detail need not pass through gates that saturate; both are ours, not the paper's. `lean` has neither GELU nor
+    LayerNorm, which take longer than the convolutions where those run in bfloat16 or int8, and a base that reaches one cell.
     """
 
     scale: Literal[2, 3] = 2
@@ -44,19 +44,21 @@ class NetworkConfig:
     def __post_init__(self) -> None:
         if self.colour == "planes" and self.unshuffle % 2:
             raise ValueError("a planes network needs an even unshuffle, which brings luma to the size of chroma")
+        if self.lean and not (self.colour == "planes" and self.learned_base):
+            raise ValueError("a lean network is one of planes, with a base that is learned")
 
     @property
     def size_multiple(self) -> int:
         return max(2, self.unshuffle)
 
 
-LEAN: dict[str, object] = {"learned_base": True, "lean": True, "unshuffle": 4, "channels": 48, "expanded": 96, "blocks": 4}
+LEAN: dict[str, object] = {"learned_base": True, "lean": True, "recurrent": False}
 PRESETS: dict[str, dict[str, object]] = {
     "planes": {"learned_base": True, "skip": True},
     "planes-no-lstm": {"learned_base": True, "recurrent": False},
     "planes-plain": {},
-    "live": {**LEAN, "recurrent": False},
-    "balanced": {**LEAN, "skip": True},
+    "live": {**LEAN, "blocks": 2},
+    "balanced": {**LEAN, "channels": 64, "expanded": 96, "blocks": 3},
     "paper": {"colour": "rgb"},
     "paper-no-lstm": {"colour": "rgb", "recurrent": False},
     "paper-no-unshuffle": {"colour": "rgb", "unshuffle": 1},
@@ -69,22 +71,34 @@ RESIDUAL_GAIN = 0.1
 
 
 class FeatureBlock(nn.Module):
-    """FEB: a linear triple, GELU, residual, LayerNorm over channels (section 3.2; the order is that of section A.2).
+    """FEB: a linear triple, GELU, residual, LayerNorm over channels (section 3.2; the order is that of section A.2)."""
 
-    A lean one: a linear triple, ReLU, residual.
-    """
-
-    def __init__(self, channels: int, expanded: int, *, lean: bool = False) -> None:
+    def __init__(self, channels: int, expanded: int) -> None:
         super().__init__()
         self.conv: nn.Module = LinearTriple(channels, expanded)
-        self.norm = None if lean else nn.LayerNorm(channels)
+        self.norm = nn.LayerNorm(channels)
 
     def forward(self, x: Tensor) -> Tensor:
-        if self.norm is None:
-            return x + F.relu(self.conv(x))
         x = x + F.gelu(self.conv(x))
         out: Tensor = self.norm(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
         return out
+
+
+class LeanBlock(nn.Module):
+    """A linear triple, residual, ReLU: one convolution and a ReLU when fused, since the identity is linear too (RepVGG, section 3.3)."""
+
+    def __init__(self, channels: int, expanded: int) -> None:
+        super().__init__()
+        self.conv = LinearTriple(channels, expanded)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(x + self.conv(x))
+
+    def fused(self) -> nn.Module:
+        conv = self.conv.fused()
+        with torch.no_grad():
+            conv.weight[:, :, 1, 1] += torch.eye(conv.in_channels).to(conv.weight)
+        return nn.Sequential(conv, nn.ReLU())
 
 
 class ConvLstm(nn.Module):
@@ -123,7 +137,8 @@ class GameSR(Network):
     """The network of a `NetworkConfig`: `step` takes a frame and a state, `forward` a clip; both are the same graph.
 
     Pictures go in and come out as `Planes` of float code values; the output is neither rounded nor clamped. The head's
-    (or tail's) last convolution starts at zero, so an untrained network is bicubic interpolation.
+    (or tail's) last convolution starts at zero, so an untrained network is bicubic interpolation; but for the chroma of a lean one,
+    whose kernels are cut to the cells beside a cell.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -141,7 +156,8 @@ class GameSR(Network):
             self.rgb_base = Interpolation("bicubic", r, s)
             self.tail = nn.Conv2d(3, 3, 3, padding=1)
         self.stem = nn.Conv2d(inputs, c, 3, padding=1)
-        self.blocks = nn.ModuleList(FeatureBlock(c, config.expanded, lean=config.lean) for _ in range(config.blocks))
+        block = LeanBlock if config.lean else FeatureBlock
+        self.blocks = nn.ModuleList(block(c, config.expanded) for _ in range(config.blocks))
         self.lstm = ConvLstm(c) if config.recurrent else None
         self.head: nn.Conv2d | MergedHead = nn.Conv2d(c, outputs, 3, padding=1)
         last = self.head if config.colour == "planes" else self.tail
@@ -190,9 +206,9 @@ class GameSR(Network):
         return self._picture(frames, source, features, lambda samples: samples).unflatten_time(batch), state
 
     def deployed(self) -> Self:
-        """Triples become one convolution, and the base goes into the head where it reaches one cell."""
+        """Triples become one convolution, and a base that reaches one cell goes into the head."""
         super().deployed()
-        if self.config.colour == "planes" and self.config.unshuffle >= 4:
+        if self.config.lean:
             self._merge_base()
         return self
 
@@ -216,7 +232,7 @@ class GameSR(Network):
         scale = self.config.scale
         if not self.config.learned_base:
             return Interpolation("bicubic", scale, block, shift)
-        return LearnedInterpolation("bicubic", scale, block, shift, reach=max(1, 4 // self.config.unshuffle))
+        return LearnedInterpolation("bicubic", scale, block, shift, reach=1 if self.config.lean else 2)
 
     def _source(self, frame: Planes) -> Tensor:
         """What the layers see: the planes' cells around zero, with one more around them for a merged head, or RGB."""

@@ -38,7 +38,7 @@ def test_artifact_equals_float64_over_recurrent_steps(artifacts: dict[str, Path]
     assert len(errors) == 40
     assert max(e.max_code_error for e in errors) <= 1
     assert max(e.differing_pixels for e in errors) < 1e-3
-    assert max(e.max_state_error for e in errors[20:]) < (5e-4 if name.startswith("balanced") else 1e-4)  # no norm holds its features
+    assert max(e.max_state_error for e in errors[20:]) < 1e-4
 
 
 def test_parity_notices_a_wrong_weight(artifacts: dict[str, Path], tmp_path: Path) -> None:
