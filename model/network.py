@@ -84,21 +84,24 @@ class FeatureBlock(nn.Module):
         return out
 
 
+LEAK = 0.1  # of a lean network's ReLUs: without it, and without a norm, whole blocks died within a thousand steps
+
+
 class LeanBlock(nn.Module):
-    """A linear triple, residual, ReLU: one convolution and a ReLU when fused, since the identity is linear too (RepVGG, section 3.3)."""
+    """A linear triple, residual, leaky ReLU: a convolution and the ReLU when fused, the identity being linear too (RepVGG, section 3.3)."""
 
     def __init__(self, channels: int, expanded: int) -> None:
         super().__init__()
         self.conv = LinearTriple(channels, expanded)
 
     def forward(self, x: Tensor) -> Tensor:
-        return F.relu(x + self.conv(x))
+        return F.leaky_relu(x + self.conv(x), LEAK)
 
     def fused(self) -> nn.Module:
         conv = self.conv.fused()
         with torch.no_grad():
             conv.weight[:, :, 1, 1] += torch.eye(conv.in_channels).to(conv.weight)
-        return nn.Sequential(conv, nn.ReLU())
+        return nn.Sequential(conv, nn.LeakyReLU(LEAK))
 
 
 class ConvLstm(nn.Module):
@@ -253,7 +256,7 @@ class GameSR(Network):
             x = self.stem(INPUT_GAIN * F.pixel_unshuffle(source - 0.5, self.config.unshuffle))
         else:
             x = self.stem(INPUT_GAIN * source)
-        total = x = F.relu(x)
+        total = x = F.leaky_relu(x, LEAK) if self.config.lean else F.relu(x)
         for block in self.blocks:
             x = block(x)
             total = x if self.config.lean else total + x

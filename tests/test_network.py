@@ -109,7 +109,7 @@ def test_the_base_of_a_lean_network_is_bicubic_of_luma_and_of_chroma_with_the_fa
 
 def test_what_runs_of_a_lean_block_is_one_convolution() -> None:
     blocks = random_network("live", 2).deployed().blocks
-    assert [[type(layer) for layer in block] for block in blocks] == [[nn.Conv2d, nn.ReLU]] * 2
+    assert [[type(layer) for layer in block] for block in blocks] == [[nn.Conv2d, nn.LeakyReLU]] * 2
 
 
 def test_a_lean_network_has_planes_and_a_learned_base() -> None:
