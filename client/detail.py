@@ -42,7 +42,8 @@ class DetailUpscaler:
 
     Detail is the gradient energy of the decoded luma; `share` of the squares, above 0 and below 1, are chosen in every frame, for that
     frame alone. They are joined into few windows, which may take in some more, and computed as in a whole frame; where that would
-    cost nearly as much as the whole frame, all of it is computed. The state of a square that is left out stays as it was.
+    cost nearly as much as the whole frame, all of it is computed. The state of a square that is left out stays as it was: computing it or
+    zeroing it made no difference.
 
     Raises ModelError for models of two scales and for one that does not say how far it reaches, ProviderError for a runtime that
     compiles a model for every size anew, and ValueError for another share.
@@ -103,6 +104,6 @@ def gradient_energy(y: Plane, side: int) -> NDArray[np.float64]:
     np.subtract(y[:, 1:], y[:, :-1], out=across[:, :-1], dtype=np.int16)
     squares = np.square(down, dtype=np.int32) + np.square(across, dtype=np.int32)
     rows, columns = (np.arange(0, size, side) for size in y.shape)
-    total = np.add.reduceat(np.add.reduceat(squares, rows, 0), columns, 1)  # of 128x128 pixels at most: below 2^31
+    total = np.add.reduceat(np.add.reduceat(squares, rows, 0), columns, 1)  # below 2^31 up to squares of 128
     heights, widths = (np.diff(np.append(starts, size)) for starts, size in ((rows, y.shape[0]), (columns, y.shape[1])))
     return np.asarray(total / (heights[:, None] * widths))
