@@ -15,6 +15,7 @@ from types import FrameType
 
 from client.baselines import Baselines
 from client.compare import ComparisonWriter
+from client.detail import DetailUpscaler
 from client.errors import GamesrError, InputError, ModelError, OutputError
 from client.models import DEFAULT_MODEL, find_model
 from client.pipeline import upscale_stream
@@ -65,10 +66,17 @@ def parser() -> argparse.ArgumentParser:
         "--reference", metavar="HR", type=Path, help="the original, SCALE times as large: measure against it, frame by frame"
     )
     parser.add_argument("--compare", metavar="FILE", type=Path, help="draw bicubic against ours, as .png or .mp4")
-    parser.add_argument(
+    part = parser.add_mutually_exclusive_group()
+    part.add_argument(
         "--skip-unchanged",
         action="store_true",
         help="compute only the tiles that changed; without a state exact, else some pixels differ a little from computing all",
+    )
+    part.add_argument(
+        "--detail-share",
+        metavar="S",
+        type=_share,
+        help="run the network only where most detail is, on about this share of the picture, such as 0.25; bicubic elsewhere",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the summary")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
@@ -113,6 +121,10 @@ def upscale(arguments: argparse.Namespace) -> Summary:
         sink = stack.enter_context(FileSink(output, source, force=arguments.force))
         size = source.width * scale, source.height * scale
         skipping = SkippingUpscaler(upscaler) if arguments.skip_unchanged else None
+        detail = None
+        if arguments.detail_share is not None:
+            base = OnnxUpscaler(find_model("bicubic", scale), provider=arguments.provider, threads=arguments.threads)
+            detail = DetailUpscaler(upscaler, base, arguments.detail_share)
         reference = comparison = baselines = None
         if arguments.reference:
             reference = stack.enter_context(Reference(arguments.reference, *size, ("ours", "bicubic", "lanczos")))
@@ -123,13 +135,17 @@ def upscale(arguments: argparse.Namespace) -> Summary:
         if reference or comparison:
             names = ("bicubic", "lanczos") if reference else ("bicubic",)
             baselines = Baselines(names, scale, provider=arguments.provider, threads=arguments.threads)
-        upscaler.warm_up(source.height, source.width)
+        (detail or upscaler).warm_up(source.height, source.width)
+        if skipping:
+            stream = upscale_stream(source, skipping, sink)
+        else:
+            stream = upscale_stream(source, detail, sink) if detail else upscale_stream(source, upscaler, sink)
 
         stamps: list[Stamps] = []
         damaged_frames = state_resets = 0
         computed_shares: list[float] = []
         progress = stack.enter_context(Progress(sys.stderr, source.estimated_frames))
-        for done in upscale_stream(source, skipping, sink) if skipping else upscale_stream(source, upscaler, sink):
+        for done in stream:
             stamps.append(done.stamps)
             computed_shares.append(done.computed_share)
             damaged_frames += done.decoded.damaged
@@ -145,6 +161,7 @@ def upscale(arguments: argparse.Namespace) -> Summary:
             raise InputError(f"no frame of {arguments.input} could be decoded ({source.decode_errors} packets were refused)")
         quality = reference.result() if reference else {}
         notes = _source_notes(source, len(stamps), measured=reference is not None) + (reference.notes if reference else [])
+    computed_share = sum(computed_shares) / len(computed_shares)
     return Summary(
         input=arguments.input,
         output=output,
@@ -157,7 +174,8 @@ def upscale(arguments: argparse.Namespace) -> Summary:
         decode_errors=source.decode_errors,
         damaged_frames=damaged_frames,
         state_resets=state_resets,
-        skipped_share=1 - sum(computed_shares) / len(computed_shares) if skipping else None,
+        skipped_share=1 - computed_share if skipping else None,
+        network_share=computed_share if detail else None,
         quality=quality,
         notes=notes + sink.notes,
     )
@@ -188,6 +206,13 @@ def _check_distinct(output: Path, arguments: argparse.Namespace) -> None:
             raise OutputError(f"cannot write {path}: it is {taken[path.resolve()]}")
         if path:
             taken[path.resolve()] = "the output"
+
+
+def _share(text: str) -> float:
+    share = float(text)
+    if not 0 < share < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not between 0 and 1")
+    return share
 
 
 def _thread_count(text: str) -> int:

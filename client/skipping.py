@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from client.artifact import ModelSpec
-from client.errors import ModelError, ProviderError
-from client.frames import Frame, Plane
-from client.runtime import OPENVINO
-from client.tiles import Box, Mask, TileGrid, Window
+from client.frames import Frame
+from client.tiles import Mask, TileGrid, Window
 from client.upscaler import OnnxUpscaler, State, copy_padded, plane_shapes
+from client.windows import run_windows, windowed_reach
 
 # Frames for which a recurrent network goes on with a tile that has stopped changing; docs/skipping.md says how it was measured.
 SETTLING_FRAMES = 8
@@ -59,16 +58,10 @@ class SkippingUpscaler:
     """
 
     def __init__(self, upscaler: OnnxUpscaler, *, settling_frames: int = SETTLING_FRAMES) -> None:
-        if upscaler.provider in OPENVINO:
-            raise ProviderError("OpenVINO compiles a model for every size of a window: leave out what did not change with --provider cpu")
-        if upscaler.spec.reach is None:
-            raise ModelError(
-                f"model {upscaler.spec.name} does not say how far it reaches: export it again to leave out what did not change"
-            )
+        self._reach = windowed_reach(upscaler)
         self.spec: ModelSpec = upscaler.spec
         self.provider, self.threads = upscaler.provider, upscaler.threads
         self._upscaler = upscaler
-        self._reach = upscaler.spec.reach
         self._settling_frames = settling_frames if upscaler.spec.state else 1
 
     def initial_state(self, height: int, width: int) -> SkippingState:
@@ -106,37 +99,13 @@ class SkippingUpscaler:
         return self._next(picture, memory, 1.0, restarted)
 
     def _windows(self, frame: Frame, last: Frame, memory: _Memory, windows: list[Window]) -> tuple[Frame, SkippingState]:
-        planes = [last.y.copy(), last.u.copy(), last.v.copy()]
-        computed = np.zeros(memory.grid.shape, bool)
-        states = []
-        for window in windows:
-            picture, state = self._upscaler.step(memory.cut(window.outer), self._cut_state(memory.state, window.outer))
-            if state.restarted:  # lost in one place is lost
-                memory.state = self._upscaler.initial_state(frame.height, frame.width)
-                return self._whole(frame, memory, restarted=True)
-            self._paste(picture, window, planes)
-            computed[memory.grid.tiles(window.inner)] = True
-            states.append(state)
-        for window, state in zip(windows, states, strict=True):  # only now: each window begins with the state before this frame
-            self._paste_state(state, window, memory.state)
+        picture = replace(frame, y=last.y.copy(), u=last.u.copy(), v=last.v.copy())
+        if not run_windows(self._upscaler, frame, windows, memory.state, picture):  # lost in one place is lost
+            memory.state = self._upscaler.initial_state(frame.height, frame.width)
+            return self._whole(frame, memory, restarted=True)
+        computed = memory.grid.held(windows)
         memory.count(computed)
-        return self._next(replace(frame, y=planes[0], u=planes[1], v=planes[2]), memory, float(computed.mean()), False)
-
-    def _cut_state(self, state: State, outer: Box) -> State:
-        part = self._upscaler.initial_state(outer.bottom - outer.top, outer.right - outer.left)
-        for spec, target, source in zip(self.spec.state, part.tensors(), state.tensors(), strict=True):
-            target[:] = source[(..., *outer.slices(divide=spec.divisor))]
-        return part
-
-    def _paste_state(self, part: State, window: Window, state: State) -> None:
-        for spec, target, source in zip(self.spec.state, state.tensors(), part.tensors(), strict=True):
-            target[(..., *window.inner.slices(divide=spec.divisor))] = source[(..., *window.inside().slices(divide=spec.divisor))]
-
-    def _paste(self, picture: Frame, window: Window, planes: list[Plane]) -> None:
-        scale = self.spec.scale
-        for target, source, divide in zip(planes, (picture.y, picture.u, picture.v), (1, 2, 2), strict=True):
-            place = target[window.inner.slices(scale, divide)]  # ends with the picture, where the frame is padded
-            place[:] = source[window.inside().slices(scale, divide)][: place.shape[0], : place.shape[1]]
+        return self._next(picture, memory, float(computed.mean()), False)
 
     def _next(self, picture: Frame, memory: _Memory, share: float, restarted: bool) -> tuple[Frame, SkippingState]:
         for plane in (picture.y, picture.u, picture.v):
@@ -168,12 +137,6 @@ class _Memory:
         changed = self.grid.changed(self._before, self._after)
         self.ages[changed] = 0
         return changed
-
-    def cut(self, box: Box) -> Frame:
-        """An area of the frame that was taken last."""
-        y, u, v = self._after
-        chroma = box.slices(divide=2)
-        return Frame(y[box.slices()], u[chroma], v[chroma])
 
     def count(self, computed: Mask | slice, *, begin_anew: bool = False) -> None:
         if begin_anew:

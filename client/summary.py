@@ -39,6 +39,7 @@ class Summary:
     damaged_frames: int
     state_resets: int
     skipped_share: float | None = None
+    network_share: float | None = None
     quality: Mapping[str, Quality] = field(default_factory=dict)
     notes: Sequence[str] = ()
 
@@ -55,6 +56,7 @@ class Summary:
             "damaged_frames": self.damaged_frames,
             "state_resets": self.state_resets,
             "skipped_share": self.skipped_share,
+            "network_share": self.network_share,
             "input": {"path": str(self.input), "width": self.input_size[0], "height": self.input_size[1]},
             "output": {"path": str(self.output), "width": self.output_size[0], "height": self.output_size[1]},
             "model": {
@@ -86,6 +88,8 @@ class Summary:
             lines.append(f"  trouble  {self.decode_errors} packets not decoded, {resets}")
         if self.skipped_share is not None:
             lines.append(f"  skipped  {100 * self.skipped_share:.1f}% of the tiles, which had not changed")
+        if self.network_share is not None:
+            lines.append(f"  network  on {100 * self.network_share:.1f}% of the picture, where most detail is; bicubic elsewhere")
         lines.append(f"  {'latency, ms':<12}" + "".join(f"{head:>10}" for head in ("p50", "p95", "p99", "max")))
         for stage, latency in stage_latencies(self.stamps).items():
             values = (latency.p50, latency.p95, latency.p99, latency.max)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,15 +51,15 @@ class Window:
 
 
 class TileGrid:
-    """A frame of `height` x `width` luma pixels, both multiples of `multiple`, cut into square tiles of at least 32 pixels.
+    """A frame of `height` x `width` luma pixels, both multiples of `multiple`, cut into square tiles of at least `min_tile` pixels.
 
     `halo` is how far around a tile its computation looks, in pixels, a multiple of `multiple`. Tiles at the right and lower edge
     may be smaller.
     """
 
-    def __init__(self, height: int, width: int, multiple: int, halo: int) -> None:
+    def __init__(self, height: int, width: int, multiple: int, halo: int, min_tile: int = MIN_TILE) -> None:
         self.height, self.width, self.halo = height, width, halo
-        self.tile = -(-MIN_TILE // multiple) * multiple
+        self.tile = -(-min_tile // multiple) * multiple
         self.shape = -(-height // self.tile), -(-width // self.tile)
         self._seen = [self._grains(count, size) for count, size in zip(self.shape, (height, width), strict=True)]
 
@@ -92,9 +93,13 @@ class TileGrid:
         inner, outer = self._pixels(boxes, 0), self._pixels(boxes, self.halo)
         return [Window(Box(*a), Box(*b)) for a, b in zip(inner.tolist(), outer.tolist(), strict=True)]
 
-    def tiles(self, box: Box) -> tuple[slice, slice]:
-        """The tiles that a window's inner area is made of."""
-        return slice(box.top // self.tile, -(-box.bottom // self.tile)), slice(box.left // self.tile, -(-box.right // self.tile))
+    def held(self, windows: Sequence[Window]) -> Mask:
+        """The tiles that the windows' inner areas are made of."""
+        mask = np.zeros(self.shape, bool)
+        for window in windows:
+            box = window.inner
+            mask[box.top // self.tile : -(-box.bottom // self.tile), box.left // self.tile : -(-box.right // self.tile)] = True
+        return mask
 
     def _grains(self, count: int, size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """First grain, and the one behind the last, of what each of `count` tiles of an axis looks at."""

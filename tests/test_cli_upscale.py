@@ -131,6 +131,27 @@ def test_skipping_is_said_and_changes_nothing_without_a_state(make_clip: MakeCli
     assert "% of the tiles" in capsys.readouterr().out
 
 
+def test_leaving_squares_to_bicubic_is_said_and_changes_nothing_of_bicubic(make_clip: MakeClip, capsys: pytest.CaptureFixture[str]) -> None:
+    clip = make_clip(width=320, height=192)
+    output = clip.with_name("clip_gamesr_x2.mp4")
+    contents, records = [], []
+    for options in ([], ["--detail-share", "0.25"]):
+        assert cli.main([str(clip), "--model", "bicubic", "--json", "--force", *options]) == 0
+        contents.append(output.read_bytes())
+        records.append(json.loads(capsys.readouterr().out))
+    assert contents[0] == contents[1]
+    assert records[0]["network_share"] is None and 0.2 < records[1]["network_share"] < 0.8
+    assert cli.main([str(clip), "--model", "bicubic", "--force", "--detail-share", "0.25"]) == 0
+    assert "bicubic elsewhere" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("options", [["0"], ["1"], ["nan"], ["half"], ["0.5", "--skip-unchanged"]])
+def test_a_share_that_is_none_is_wrong_usage(make_clip: MakeClip, options: list[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        cli.main([str(make_clip()), "--detail-share", *options])
+    assert stopped.value.code == 2
+
+
 def test_existing_output_needs_force(make_clip: MakeClip, tiny: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     clip, output = make_clip(), tmp_path / "out.mp4"
     output.write_text("mine")
