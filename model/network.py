@@ -58,7 +58,7 @@ PRESETS: dict[str, dict[str, object]] = {
     "planes-no-lstm": {"learned_base": True, "recurrent": False},
     "planes-plain": {},
     "live": {**LEAN, "blocks": 2},
-    "balanced": {**LEAN, "channels": 64, "expanded": 96, "blocks": 3},
+    "balanced": {**LEAN, "blocks": 6},
     "paper": {"colour": "rgb"},
     "paper-no-lstm": {"colour": "rgb", "recurrent": False},
     "paper-no-unshuffle": {"colour": "rgb", "unshuffle": 1},

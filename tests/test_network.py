@@ -24,7 +24,7 @@ from tests.networks import random_clip, random_network
         ("planes", 2, 288_472 + 1_700, 129_112 + 1_700),  # and the learned kernels under the residual
         ("planes", 3, 297_142 + 3_825, 137_782 + 3_825),
         ("live", 2, 91_548, 27_804),
-        ("balanced", 2, 304_444, 128_764),
+        ("balanced", 2, 91_548 + 4 * 41_120, 27_804 + 4 * 9_248),
     ],
 )
 def test_parameter_counts(preset: str, scale: int, training: int, fused: int) -> None:
