@@ -28,8 +28,9 @@ from client.sink import NullSink
 from client.stream_source import EncodedFile, EncodedLive
 from client.upscaler import OnnxUpscaler
 from client.video import read_frames
+from server.link import Weather
 from tests.conftest import FRAMES
-from tests.lossy import LossyProxy, Weather
+from tests.lossy import LossyProxy
 from tests.streaming import CALM, planes
 from tests.test_rtp import unit
 
