@@ -13,10 +13,18 @@ from typing import Protocol
 from client.live import LiveDecoder, Received
 from client.reception import Address, Reception
 from client.rtp import asks_for_keyframe
-from client.sender import IDR_INTERVAL_NS, RtpStream, UnitSource
+from client.sender import IDR_INTERVAL_NS, RtpStream, Unit
 
 SENDER: Address = ("127.0.0.1", 40000)
 _STEP_NS = 100_000  # abs-send-time counts in 3.8 us, and pictures are milliseconds apart
+
+
+class Source(Protocol):
+    """What is streamed: `client.sender.UnitSource` as far as it can make an IDR whenever it is asked for."""
+
+    def due_ns(self) -> int | None: ...
+
+    def take(self, *, idr: bool) -> Unit: ...
 
 
 class Carrier(Protocol):
@@ -49,7 +57,7 @@ class Simulation:
     `requested_idrs` are the numbers of the pictures that became one.
     """
 
-    def __init__(self, source: UnitSource, forth: Carrier, back: Carrier) -> None:
+    def __init__(self, source: Source, forth: Carrier, back: Carrier) -> None:
         self.sent = 0
         self.requested_idrs: list[int] = []
         self.reception, self.decoder = Reception(wall_offset_ns=0), LiveDecoder()
@@ -92,7 +100,7 @@ class Simulation:
     def _send(self, now_ns: int) -> None:
         answered = self.requested_idrs
         recent = bool(answered) and now_ns - self._sent_ns[answered[-1]] < IDR_INTERVAL_NS
-        idr = self._asked and self._source.answers_requests and not recent
+        idr = self._asked and not recent
         if idr:
             self._asked = False
             answered.append(self.sent)

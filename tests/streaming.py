@@ -67,17 +67,12 @@ class Played:
 class Cloud:
     """Encodes scenes on demand and remembers what a receiver without loss would see."""
 
-    answers_requests = True
-
     def __init__(self, settings: NetworkSettings) -> None:
         self.sent = 0
         self._encoder = CloudEncoder(settings, WIDTH, HEIGHT)
         self._decoder = av.CodecContext.create("h264", "r")
         self._decoder.thread_count = 1
         self.pictures: list[bytes] = []
-
-    def parameter_sets(self) -> list[bytes]:
-        return []  # nobody is told of them outside the stream
 
     def due_ns(self) -> int:
         return self.sent * 1_000_000_000 // FPS
