@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import av
 import pytest
+from av.codec.context import ThreadType
 
+import client.live
 from client.cloud import CloudEncoder, NetworkSettings
 from client.frames import Frame
 from client.live import LiveDecoder
+from client.quality import squared_error
 from client.reception import Reception
 from client.rtp import CLOCK_HZ
 from client.sender import RtpStream, Unit
@@ -153,3 +156,19 @@ def test_another_size_in_mid_stream(restart: bool) -> None:
     assert reception.counts.senders == (3 if restart else 1)
     stamps = [item.frame.pts or 0 for item in got]
     assert stamps == sorted(set(stamps))
+
+
+@MODES
+def test_one_thread_conceals_better_than_sliced_ones(settings: NetworkSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Why the live decoder has one: should libavcodec ever conceal as well with several, it may have them."""
+
+    def error() -> int:
+        played = play(settings, CALM, drop={(index, 1) for index in range(20, 60, 10)}, frames=60)
+        pairs = zip(played.shown, played.received, strict=True)
+        return sum(squared_error(scene(shown.index).y, item.frame.y) for shown, item in pairs if shown.damaged)
+
+    one = error()
+    sliced = client.live._open_decoder()
+    sliced.thread_type, sliced.thread_count = ThreadType.SLICE, 2
+    monkeypatch.setattr(client.live, "_open_decoder", lambda: sliced)
+    assert 0 < one < error()
