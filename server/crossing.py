@@ -30,8 +30,8 @@ KEPT_BYTES = 1 << 30
 class Clip:
     """A clip's first frames, as many as a gibibyte holds: their luma to measure against, and reduced by area to be sent.
 
-    `scale` brings them back to full size. Raises InputError for a clip that cannot be read, or whose height and width are not
-    whole even multiples of what `height` asks for.
+    `scale` brings them back to full size. Raises InputError for a clip that cannot be read, that changes its size, or whose height
+    and width are not whole even multiples of what `height` asks for.
     """
 
     def __init__(self, path: Path, height: int, frames: int) -> None:
@@ -40,12 +40,14 @@ class Clip:
             self.scale, rest = divmod(source.height, height)
             if rest or not self.scale or source.height % (2 * self.scale) or source.width % (2 * self.scale):
                 raise InputError(f"{path} is {source.width}x{source.height}, which cannot be reduced to a height of {height} evenly")
-            full = source.width * source.height
-            kept = max(1, KEPT_BYTES // (full + full * 3 // (2 * self.scale**2)))
+            size = source.height, source.width
+        kept = max(1, KEPT_BYTES // (size[0] * size[1] * (2 * self.scale**2 + 3) // (2 * self.scale**2)))
         self.name = path.stem
         self.references: list[Plane] = []
         self.reduced: list[Frame] = []
         for frame in clip_frames(path, 1, min(frames, kept)):
+            if frame.y.shape != size:
+                raise InputError(f"{path} changes its size in mid-stream, which cannot be measured")
             self.references.append(frame.y.copy())
             self.reduced.append(area_downscale(frame, self.scale))
 

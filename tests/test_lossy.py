@@ -171,11 +171,14 @@ def test_what_cannot_be_measured_is_refused_in_a_sentence(
     assert err.startswith(f"gamesr-loss: {says.format(**names)}") and err.count("\n") == 1
 
 
-def test_no_clip_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_clip_is_refused(tmp_path: Path, make_clip: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "text.mp4").write_text("no video")
-    for name, says in (("text.mp4", "is not a video file"), ("missing.mp4", "does not exist")):
-        assert main([str(tmp_path / name)]) == 1
-        assert says in capsys.readouterr().err
+    parts = [make_clip(name, frames=2, width=width).read_bytes() for name, width in (("a.h264", 64), ("b.h264", 96))]
+    (tmp_path / "both.h264").write_bytes(b"".join(parts))
+    for name, says in (("text.mp4", "is not a video file"), ("missing.mp4", "does not exist"), ("both.h264", "changes its size")):
+        assert main([str(tmp_path / name), "--height", "24"]) == 1
+        err = capsys.readouterr().err
+        assert says in err and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("options", [["--frames", "0"], ["--frames", "x"], ["--bitrate", "0"], ["--height", "-540"], ["--seed", "x"]])
