@@ -44,7 +44,7 @@ class Restart(Enum):
     """Why the network's memory began anew at a frame."""
 
     SIZE = "the picture changed size"
-    DAMAGE = "the stream was damaged, or whole again"
+    DAMAGE = "the stream was damaged until here"
     LOST = "the state was not finite"
 
 
@@ -66,9 +66,9 @@ class FrameDone:
 def upscale_stream(source: Iterable[Decoded], upscaler: Upscaler[AnyState], sink: Sink) -> Iterator[FrameDone]:
     """Upscale every frame of `source` in order into `sink`, one at a time, the state carried from frame to frame.
 
-    The state starts from zeros with the stream, and again where the picture changes size, where damage begins and where it
-    ends, and where the state is lost. What the caller does between two frames is in no stage's time. Raises what source,
-    upscaler and sink raise.
+    The state starts from zeros with the stream, and again where the picture changes size, where damage ends, so that nothing of it
+    reaches a clean picture, and where the state is lost. What the caller does between two frames is in no stage's time. Raises what
+    source, upscaler and sink raise.
     """
     state: AnyState | None = None
     damaged = False
@@ -78,7 +78,7 @@ def upscale_stream(source: Iterable[Decoded], upscaler: Upscaler[AnyState], sink
             state = upscaler.initial_state(frame.height, frame.width)
         elif (frame.height, frame.width) != (state.height, state.width):
             state, restart = upscaler.initial_state(frame.height, frame.width), Restart.SIZE
-        elif frame.damaged != damaged:
+        elif damaged and not frame.damaged:
             state, restart = upscaler.initial_state(frame.height, frame.width), Restart.DAMAGE
         damaged = frame.damaged
         picture, state = upscaler.step(frame, state)

@@ -40,7 +40,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("clip", metavar="CLIP", type=Path, help="the video that stands for the game")
     parser.add_argument("--to", metavar="HOST:PORT", type=_address, required=True, help="who receives it")
     parser.add_argument("--height", metavar="N", type=_positive, help="reduce the picture to this height, a whole part of the clip's")
-    parser.add_argument("--bitrate", metavar="RATE", type=_kbps, help="such as 8M or 4500k (default: 8M)")
+    parser.add_argument("--bitrate", metavar="RATE", type=kbps, help="such as 8M or 4500k (default: 8M)")
     parser.add_argument("--fps", metavar="N", type=_positive, help="pictures a second (default: the clip's)")
     parser.add_argument("--intra-refresh", action="store_true", help="a wandering column of intra blocks instead of IDRs")
     parser.add_argument("--copy", action="store_true", help="send the clip's own H.264, not encoded again")
@@ -101,9 +101,9 @@ def send(arguments: argparse.Namespace) -> int:
             status = 130
     period_ms = 1000 / fps
     late = sum(done.late_ns / 1e6 > period_ms for done in sent)
-    kbps = sum(done.bytes for done in sent) * 8 / 1000 / max(1, len(sent)) * fps
+    rate_kbps = sum(done.bytes for done in sent) * 8 / 1000 / max(1, len(sent)) * fps
     print(
-        f"{len(sent)} pictures in {sum(done.packets for done in sent)} packets, {kbps:.0f} kbit/s on the wire; "
+        f"{len(sent)} pictures in {sum(done.packets for done in sent)} packets, {rate_kbps:.0f} kbit/s on the wire; "
         f"{late} late by more than {period_ms:.1f} ms; {sender.requests} key frame requests"
         f"{'' if source.answers_requests or not sender.requests else ', not answered: --copy has only those of the file'}",
         flush=True,
@@ -131,15 +131,16 @@ def _address(text: str) -> tuple[str, int]:
     return host.strip("[]"), int(port)
 
 
-def _kbps(text: str) -> int:
+def kbps(text: str) -> int:
+    """A bitrate as people write it, 8M or 4500k, in kbit/s; raises ArgumentTypeError."""
     number, unit = text[:-1], text[-1:].lower()
     try:
-        kbps = round(float(number) * {"k": 1, "m": 1000}[unit])
+        rate = round(float(number) * {"k": 1, "m": 1000}[unit])
     except (KeyError, ValueError, OverflowError) as error:
         raise argparse.ArgumentTypeError(f"{text} is not a bitrate such as 8M or 4500k") from error
-    if not 1 <= kbps <= 1_000_000:
+    if not 1 <= rate <= 1_000_000:
         raise argparse.ArgumentTypeError(f"{text} is not between 1k and 1000M")
-    return kbps
+    return rate
 
 
 def _positive(text: str) -> int:

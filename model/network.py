@@ -93,6 +93,10 @@ class LeanBlock(nn.Module):
     def __init__(self, channels: int, expanded: int) -> None:
         super().__init__()
         self.conv = LinearTriple(channels, expanded)
+        # It begins as nothing but the leak: depth costs no stability, and blocks can be added to a trained network.
+        nn.init.zeros_(self.conv.compress.weight)
+        assert self.conv.compress.bias is not None
+        nn.init.zeros_(self.conv.compress.bias)
 
     def forward(self, x: Tensor) -> Tensor:
         return F.leaky_relu(x + self.conv(x), LEAK)

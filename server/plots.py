@@ -1,11 +1,12 @@
-"""A sweep's pictures: rate-distortion curves, and latency against the deadlines of 60 and 120 frames a second."""
+"""Pictures of what was measured: rate-distortion curves, latency against the deadlines of 60 and 120 frames a second, PSNR over time."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from itertools import cycle, product
+from itertools import cycle, groupby, product
 from statistics import fmean
 from typing import Any
 
@@ -14,8 +15,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
 
+from client.quality import psnr_db
 from server.curves import GRADES, METRICS, Series, label, series_by_clip
 from server.points import NO_UPSCALER, LatencyResult, PointResult
+from server.viewing import View, Viewing
 
 # M. Okabe and K. Ito, "Color Universal Design", 2008, without the yellow, which is too pale for a line on white.
 _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9")
@@ -28,6 +31,7 @@ _MBPS_TICKS = (0.25, 0.5, 1, 2, 4, 8, 16, 32, 64)
 _PANEL_INCHES = (4.8, 3.6)
 _COLUMNS = 2
 _DEADLINES_MS = {60: 1000 / 60, 120: 1000 / 120}
+_SHADES = {View.DAMAGED: (_COLOURS[1], 0.25), View.FROZEN: (_GREY, 0.5)}
 _LEAST_MS = 0.5  # where the axis of latencies begins
 
 
@@ -58,6 +62,15 @@ def latency_figure(latencies: Sequence[LatencyResult]) -> Figure:
         figure, axes = _panels(len(clips))
         for axis, (clip, of_clip) in zip(axes, clips.items(), strict=True):
             _draw_latency(axis, clip, of_clip)
+    return figure
+
+
+def over_time_figure(viewings: Mapping[str, Viewing]) -> Figure:
+    """PSNR-Y of every picture that was sent, by upscaler, over time: one panel a title, damaged and frozen times shaded."""
+    with _look():
+        figure, axes = _panels(len(viewings))
+        for axis, (title, seen) in zip(axes, viewings.items(), strict=True):
+            _draw_over_time(axis, title, seen)
     return figure
 
 
@@ -208,3 +221,24 @@ def _draw_latency(axis: Axes, clip: str, latencies: Sequence[LatencyResult]) -> 
     axis.xaxis.set_minor_formatter(NullFormatter())
     axis.set_title(clip, pad=14)
     axis.set_xlabel("one frame, decode to write, ms: p50 (dark) / p95 (pale)")
+
+
+def _draw_over_time(axis: Axes, title: str, seen: Viewing) -> None:
+    for view, run in groupby(range(len(seen.views)), seen.views.__getitem__):
+        if view in _SHADES:
+            colour, alpha = _SHADES[view]
+            indices = list(run)
+            axis.axvspan(indices[0] / seen.fps, (indices[-1] + 1) / seen.fps, color=colour, alpha=alpha, linewidth=0)
+    ends = []
+    for name, style in _styles(list(seen.errors)).items():
+        if name in seen.errors:
+            times = [index / seen.fps for index in range(len(seen.views))]
+            qualities = [psnr_db(error) if error else math.nan for error in seen.errors[name]]
+            axis.plot(times, qualities, color=style["color"], linestyle=style["linestyle"], linewidth=1.1)
+            ends.append((qualities[-1], times[-1], name, style["color"]))
+    axis.set_title(title)
+    axis.set_xlabel("time, s (orange: damaged, grey: frozen)")
+    axis.set_ylabel("PSNR-Y of each picture, dB")
+    axis.margins(x=0.01)
+    axis.grid(axis="y", color=_GREY, alpha=0.25, linewidth=0.6)
+    _label_ends(axis, sorted(end for end in ends if not math.isnan(end[0])))

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import functools
-import heapq
-import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
 
@@ -15,14 +12,14 @@ import numpy as np
 from client.cloud import CloudEncoder, NetworkSettings
 from client.frames import Frame
 from client.live import LiveDecoder, Received
-from client.reception import Address, Reception
-from client.rtp import CLOCK_HZ, asks_for_keyframe
-from client.sender import RtpStream, Unit
+from client.reception import Reception
+from client.rtp import CLOCK_HZ
+from client.sender import Unit
 from client.video import from_av_frame
-from tests.lossy import Link, Weather
+from server.link import Link, Weather
+from server.simulation import Simulation
 
 FPS, WIDTH, HEIGHT = 60, 192, 128
-SENDER: Address = ("127.0.0.1", 40000)
 CALM = Weather(delay_ns=5_000_000)
 IDR = NetworkSettings(2500, FPS, preset="ultrafast", idr_interval_s=60)
 INTRA = NetworkSettings(2500, FPS, preset="ultrafast", intra_refresh=True)
@@ -72,22 +69,35 @@ class Cloud:
 
     def __init__(self, settings: NetworkSettings) -> None:
         self.sent = 0
-        self.idrs: list[int] = []
         self._encoder = CloudEncoder(settings, WIDTH, HEIGHT)
         self._decoder = av.CodecContext.create("h264", "r")
         self._decoder.thread_count = 1
         self.pictures: list[bytes] = []
 
-    def unit(self, *, idr: bool = False) -> Unit:
+    def due_ns(self) -> int:
+        return self.sent * 1_000_000_000 // FPS
+
+    def take(self, *, idr: bool = False) -> Unit:
         data = b"".join(self._encoder.encode(scene(self.sent), idr=idr))
-        if idr:
-            self.idrs.append(self.sent)
         packet = av.Packet(data)
         packet.pts, packet.time_base = self.sent, Fraction(1, FPS)
         self.pictures += [planes(from_av_frame(picture)) for picture in self._decoder.decode(packet)]
         self.sent += 1
         assert len(self.pictures) == self.sent
         return Unit(data, (self.sent - 1) * CLOCK_HZ // FPS)
+
+
+class Holes:
+    """A link that loses certain packets, each named by its picture and its number in it, before another has its turn."""
+
+    def __init__(self, link: Link, drop: set[tuple[int, int]], join: int) -> None:
+        self._link, self._drop, self._join = link, drop, join
+        self._index, self._number = -1, 0
+
+    def carry(self, size: int, now_ns: int) -> list[int]:
+        index = round(now_ns * FPS / 1e9)
+        self._index, self._number = index, self._number + 1 if index == self._index else 0
+        return [] if index < self._join or (index, self._number) in self._drop else self._link.carry(size, now_ns)
 
 
 def play(
@@ -97,47 +107,13 @@ def play(
 
     With `join` the receiver hears nothing of that many first pictures.
     """
-    cloud, stream, reception, decoder = Cloud(settings), RtpStream(), Reception(wall_offset_ns=0), LiveDecoder()
-    there, back = Link(forth, seed), Link(CALM, seed + 1)
-    numbers = itertools.count()
-    events: list[tuple[int, int, str, bytes]] = [(index * 1_000_000_000 // FPS, next(numbers), "picture", b"") for index in range(frames)]
-    heapq.heapify(events)
-    asked, received, now_ns = False, [], 0
-
-    def take(datagram: bytes | None) -> Iterator[tuple[int, Received]]:
-        units = [] if datagram is None else reception.take(datagram, SENDER, now_ns)
-        for unit in units + reception.release(now_ns):
-            errors = decoder.decode_errors
-            for item in decoder.decode(unit):
-                yield now_ns, item
-            if decoder.stuck or decoder.decode_errors > errors:
-                reception.want_keyframe()
-        if (feedback := reception.feedback(now_ns)) is not None:
-            for at in back.carry(len(feedback), now_ns):
-                heapq.heappush(events, (at, next(numbers), "feedback", feedback))
-
-    while events or reception.release_due_ns() is not None:
-        due_ns = reception.release_due_ns()
-        if due_ns is not None and (not events or due_ns <= events[0][0]):
-            now_ns = max(now_ns, due_ns)
-            received += take(None)
-            continue
-        now_ns, _, kind, datagram = heapq.heappop(events)
-        if kind == "picture":
-            index = cloud.sent
-            for number, sent in enumerate(stream.datagrams(cloud.unit(idr=asked), lambda now=now_ns: now)):
-                if index >= join and (index, number) not in (drop or ()):
-                    for at in there.carry(len(sent), now_ns):
-                        heapq.heappush(events, (at, next(numbers), "datagram", sent))
-            asked = False
-        elif kind == "feedback":
-            asked |= asks_for_keyframe(datagram, stream.ssrc)
-        else:
-            received += take(datagram)
-
+    cloud = Cloud(settings)
+    simulation = Simulation(cloud, Holes(Link(forth, seed), drop or set(), join), Link(CALM, seed + 1))
+    arrivals = list(simulation.run(frames))
     shown = []
-    for at_ns, item in received:
-        assert item.unit.sent_ns is not None
-        index = round(item.unit.sent_ns * FPS / 1e9)
-        shown.append(Shown(index, item.frame.damaged, planes(item.frame) != cloud.pictures[index], at_ns - item.unit.sent_ns))
-    return Played(shown, cloud.sent, cloud.idrs, reception, decoder, [item for _, item in received])
+    for arrival in arrivals:
+        frame, sent_ns = arrival.received.frame, arrival.received.unit.sent_ns
+        assert sent_ns is not None and arrival.index == round(sent_ns * FPS / 1e9)
+        shown.append(Shown(arrival.index, frame.damaged, planes(frame) != cloud.pictures[arrival.index], arrival.at_ns - sent_ns))
+    received = [arrival.received for arrival in arrivals]
+    return Played(shown, simulation.sent, simulation.requested_idrs, simulation.reception, simulation.decoder, received)

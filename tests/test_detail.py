@@ -114,7 +114,10 @@ def test_every_square_is_one_or_the_other_to_the_bit(live: Spy, bicubic: Spy, se
 
 def test_a_square_of_detail_costs_one_window_and_its_halo(live: Spy, bicubic: Spy) -> None:
     upscaler = DetailUpscaler(live, bicubic, 1 / 24)
-    for place, window in (((0, 0), (88, 88)), ((1, 2), (112, 112)), ((3, 5), (32, 34))):
+    reach = live.spec.reach or 0
+    corner, inside = SQUARE + reach, SQUARE + 2 * reach
+    rest = HEIGHT - 3 * SQUARE + reach, WIDTH - 5 * SQUARE + reach
+    for place, window in (((0, 0), (corner, corner)), ((1, 2), (inside, inside)), ((3, 5), rest)):
         live.taken(), bicubic.taken()
         _, state = one(upscaler, patch(place))
         assert live.taken() == [window] and bicubic.taken() == [(HEIGHT, WIDTH)]

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import av
 import pytest
+from av.codec.context import ThreadType
 
+import client.live
 from client.cloud import CloudEncoder, NetworkSettings
 from client.frames import Frame
 from client.live import LiveDecoder
+from client.quality import squared_error
 from client.reception import Reception
 from client.rtp import CLOCK_HZ
 from client.sender import RtpStream, Unit
 from client.video import from_av_frame
-from tests.lossy import Weather
-from tests.streaming import CALM, FPS, HEIGHT, IDR, INTRA, SENDER, WIDTH, Played, planes, play, scene
+from server.link import Weather
+from server.simulation import SENDER
+from tests.streaming import CALM, FPS, HEIGHT, IDR, INTRA, WIDTH, Played, planes, play, scene
 
 WIDTH_IN_BLOCKS = WIDTH // 16
 MODES = pytest.mark.parametrize("settings", [IDR, INTRA], ids=["idr", "intra-refresh"])
@@ -84,7 +88,7 @@ def test_an_idr_that_is_lost_is_asked_for_again() -> None:
     first = play(IDR, CALM, drop={(40, 1)}).idrs[0]
     played = play(IDR, CALM, drop={(40, 1), (first, 0)})
     check(played)
-    assert len(played.idrs) == 2 and played.idrs[1] - first <= FPS // 6 + 3  # requests are 100 ms apart
+    assert len(played.idrs) == 2 and played.idrs[1] - first <= FPS // 5 + 3  # asked for after 100 ms, made after 200
     assert [shown.index for shown in played.shown if shown.damaged] == list(range(40, played.idrs[1]))
 
 
@@ -152,3 +156,19 @@ def test_another_size_in_mid_stream(restart: bool) -> None:
     assert reception.counts.senders == (3 if restart else 1)
     stamps = [item.frame.pts or 0 for item in got]
     assert stamps == sorted(set(stamps))
+
+
+@MODES
+def test_one_thread_conceals_better_than_sliced_ones(settings: NetworkSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Why the live decoder has one: should libavcodec ever conceal as well with several, it may have them."""
+
+    def error() -> int:
+        played = play(settings, CALM, drop={(index, 1) for index in range(20, 60, 10)}, frames=60)
+        pairs = zip(played.shown, played.received, strict=True)
+        return sum(squared_error(scene(shown.index).y, item.frame.y) for shown, item in pairs if shown.damaged)
+
+    one = error()
+    sliced = client.live._open_decoder()
+    sliced.thread_type, sliced.thread_count = ThreadType.SLICE, 2
+    monkeypatch.setattr(client.live, "_open_decoder", lambda: sliced)
+    assert 0 < one < error()

@@ -172,13 +172,25 @@ def test_a_file_refuses_a_second_size_and_leaves_nothing(make_clip: MakeClip, up
     assert not list(tmp_path.glob("*out*"))
 
 
-def test_the_state_restarts_where_damage_begins_and_ends(make_clip: MakeClip, upscaler: OnnxUpscaler) -> None:
+def test_the_state_is_carried_into_damage_and_restarts_where_it_ends(make_clip: MakeClip, upscaler: OnnxUpscaler) -> None:
     frames = list(read_frames(make_clip()))
     damaged = [Decoded(replace(frame, damaged=3 <= index < 6), 0, 0) for index, frame in enumerate(frames)]
     done = list(upscale_stream(damaged, upscaler, NullSink()))
-    assert [d.restart for d in done] == [None] * 3 + [Restart.DAMAGE] + [None] * 2 + [Restart.DAMAGE] + [None] * 5
-    fresh, _ = upscaler.step(frames[6], upscaler.initial_state(HEIGHT, WIDTH))
-    assert same(done[6].picture, fresh)
+    assert [d.restart for d in done] == [None] * 6 + [Restart.DAMAGE] + [None] * 5
+    for begin, end in ((0, 6), (6, 12)):
+        state = upscaler.initial_state(HEIGHT, WIDTH)
+        for frame, d in zip(frames[begin:end], done[begin:end], strict=True):
+            picture, state = upscaler.step(frame, state)
+            assert same(d.picture, picture)
+    assert not same(done[6].picture, upscaler.step(frames[6], state)[0])  # the state means something
+
+
+def test_nothing_of_a_damaged_picture_reaches_a_clean_one(make_clip: MakeClip, upscaler: OnnxUpscaler) -> None:
+    """Whatever the damage was: the clean pictures after it are the same."""
+    frames = [replace(frame, damaged=3 <= index < 6) for index, frame in enumerate(read_frames(make_clip()))]
+    others = [replace(frame, y=255 - frame.y) if frame.damaged else frame for frame in frames]
+    one, other = (list(upscale_stream([Decoded(f, 0, 0) for f in way], upscaler, NullSink())) for way in (frames, others))
+    assert [same(a.picture, b.picture) for a, b in zip(one, other, strict=True)] == [not frame.damaged for frame in frames]
 
 
 def test_a_lost_state_is_said(make_clip: MakeClip, model_file: Callable[..., Path]) -> None:

@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from server.plots import _apart, latency_figure, rd_figures, rendered
+from server.plots import _apart, latency_figure, over_time_figure, rd_figures, rendered
 from server.points import PointResult
+from server.viewing import View, Viewing
 from tests.measured import latency_results, point_result, sweep_results, with_quality
 
 
@@ -79,3 +80,14 @@ def test_names_keep_their_order_their_distance_and_below_the_top(wanted: list[fl
     if all(after - before >= step for before, after in pairwise(wanted)):
         assert places == pytest.approx(wanted)
     assert sum(_apart(wanted, step, top=1000.0)) == pytest.approx(sum(wanted))
+
+
+def test_time_is_shaded_where_the_picture_was_not_clean() -> None:
+    clean, damaged, frozen = View.CLEAN, View.DAMAGED, View.FROZEN
+    errors = {"bicubic": [4.0, 9, 0, 16, 4, 4], "gamesr": [2.0, 8, 0, 20, 3, 3]}  # 0: identical, which no curve reaches
+    seen = Viewing(60, 90, 3, 1, [clean, damaged, damaged, frozen, damaged, clean], errors)
+    first, again = (rendered(over_time_figure({"IDR, 2%": seen, "intra, 2%": seen}), "svg") for _ in range(2))
+    svg = first.decode()
+    assert first == again and svg.count("<!-- bicubic -->") == svg.count("<!-- gamesr -->") == 2
+    assert "<!-- IDR, 2% -->" in svg
+    assert svg.count("fill: #e69f00; opacity: 0.25") == 4 and svg.count("fill: #767676; opacity: 0.5") == 2  # two runs and one, a panel

@@ -28,8 +28,9 @@ from client.sink import NullSink
 from client.stream_source import EncodedFile, EncodedLive
 from client.upscaler import OnnxUpscaler
 from client.video import read_frames
+from server.link import Weather
 from tests.conftest import FRAMES
-from tests.lossy import LossyProxy, Weather
+from tests.lossy import LossyProxy
 from tests.streaming import CALM, planes
 from tests.test_rtp import unit
 
@@ -99,7 +100,7 @@ def test_a_request_over_sockets_brings_an_idr(make_clip: MakeClip, receiver: Rtp
     assert counts.lost > 0 and counts.keyframe_requests > 0 and counts.damaged_units > 0
     damaged = [item.decoded.damaged for item in done]
     assert any(damaged) and not all(damaged)
-    assert [item.restart is Restart.DAMAGE for item in done[1:]] == [a != b for a, b in itertools.pairwise(damaged)]
+    assert [item.restart is Restart.DAMAGE for item in done[1:]] == [a and not b for a, b in itertools.pairwise(damaged)]
 
 
 def test_who_takes_nothing_loses_everything_but_no_memory(receiver: RtpReceiver) -> None:

@@ -16,7 +16,8 @@ from client.reception import Reception
 from client.reorder import PACKETS_HELD
 from client.rtp import keyframe_request
 from client.sender import RtpStream
-from tests.streaming import INTRA, SENDER, Cloud
+from server.simulation import SENDER
+from tests.streaming import INTRA, Cloud
 
 COUNT = int(os.environ.get("GAMESR_FUZZ_DATAGRAMS", "20000"))
 GROWTH_BYTES = 64 << 20
@@ -50,7 +51,7 @@ def mutate(datagram: bytes, other: bytes, draw: random.Random) -> bytes:
 def test_mutated_datagrams(seed: int) -> None:
     draw = random.Random(seed)
     cloud, stream = Cloud(INTRA), RtpStream()
-    pool = [datagram for n in range(90) for datagram in stream.datagrams(cloud.unit(idr=n == 45), lambda: 0)]
+    pool = [datagram for n in range(90) for datagram in stream.datagrams(cloud.take(idr=n == 45), lambda: 0)]
     pool += [stream.report(), keyframe_request(1, stream.ssrc)]
     reception, decoder = Reception(wall_offset_ns=0), LiveDecoder()
     process = psutil.Process()
@@ -78,7 +79,7 @@ def test_mutated_datagrams(seed: int) -> None:
 def test_a_unit_without_an_end_is_bounded() -> None:
     """The same timestamp for ever, never a marker: fragments that never end, and empty ones."""
     reception, stream = Reception(wall_offset_ns=0), RtpStream()
-    first, second = list(stream.datagrams(Cloud(INTRA).unit(), lambda: 0))[:2]
+    first, second = list(stream.datagrams(Cloud(INTRA).take(), lambda: 0))[:2]
     for payload in (b"\x7c\x85", b"\x7c\x05", b"\x7c\x05" + bytes(1300), b"\x61" + bytes(1300)):
         for number in range(20_000):
             sequence = (int.from_bytes(first[2:4]) + number) % 65536
