@@ -9,7 +9,8 @@ from client.frames import Frame
 
 DEFAULT_PERIOD_NS = 1_000_000_000 // 60  # until two frames have told theirs
 MAX_PERIOD_NS = 1_000_000_000
-MOST_LEFT_OUT = 8  # in a row: the picture moves even where decoding alone is too slow
+MOST_LEFT_OUT = 8  # in a row, at first: the picture moves even where decoding alone is almost too slow
+RAREST = 64  # a second of frames, as many as a receiver's queue holds
 _DIFFERENCES = 16
 
 
@@ -37,15 +38,20 @@ class DeadlineRule:
     """Whether a decoded frame is upscaled and shown, or left out because newer ones wait.
 
     With nothing newer it is always shown, late or not: late is better than never. Otherwise only if it and all that wait could still
-    be presented within the deadline of this one, at the pace of late. After eight left out in a row one is shown all the same.
+    be presented within the deadline of this one, at the pace of late. After eight left out in a row one is shown all the same, the
+    next after twice as many, up to 64, until nothing waits: else those that are shown would keep the others waiting.
     """
 
     def __init__(self) -> None:
-        self._in_a_row = 0
+        self._in_a_row, self._most = 0, MOST_LEFT_OUT
 
     def leaves_out(self, *, age_ns: int, waiting: int, frame_ns: int, deadline_ns: int) -> bool:
         """`age_ns` since its arrival, `waiting` newer ones, `frame_ns` for decoding, upscaling and presenting one."""
-        late = age_ns + (1 + waiting) * frame_ns > deadline_ns
-        left_out = waiting > 0 and late and self._in_a_row < MOST_LEFT_OUT
-        self._in_a_row = self._in_a_row + 1 if left_out else 0
-        return left_out
+        if not waiting or age_ns + (1 + waiting) * frame_ns <= deadline_ns:
+            self._in_a_row, self._most = 0, MOST_LEFT_OUT
+            return False
+        self._in_a_row += 1
+        if self._in_a_row <= self._most:
+            return True
+        self._in_a_row, self._most = 0, min(2 * self._most, RAREST)
+        return False
