@@ -57,7 +57,7 @@ class PlayTally:
     def add(self, item: Arrived, done: FrameDone, *, tier: str, deadline_ns: int, period_ns: int) -> None:
         """A frame was shown."""
         stamps, now_ns = done.stamps, done.stamps.written_ns
-        self._stamps[self.shown % KEPT_FRAMES] = (
+        self._stamps[self.shown % len(self._stamps)] = (
             item.first_ns,
             item.last_ns,
             item.ready_ns,
@@ -90,10 +90,11 @@ class PlayTally:
         """Frames that were late or left out."""
         return self.late + self.left_out
 
-    def durations_ns(self, *, network: bool, newest: int = KEPT_FRAMES) -> dict[str, NDArray[np.int64]]:
-        """By stage, of the `newest` frames that are kept; with `network` also what only packets tell. Stages without any are left out."""
-        count = min(self.shown, newest, KEPT_FRAMES)
-        rows = self._stamps[np.arange(self.shown - count, self.shown) % KEPT_FRAMES]
+    def durations_ns(self, *, network: bool, newest: int | None = None) -> dict[str, NDArray[np.int64]]:
+        """By stage, of the `newest` frames, by default of all that are kept; with `network` also what only packets tell. Stages without any are left out."""
+        kept = len(self._stamps)
+        count = min(self.shown, kept, newest or kept)
+        rows = self._stamps[np.arange(self.shown - count, self.shown) % kept]
         durations = {}
         for stage, (begin, end) in _STAGES.items():
             known = rows[rows[:, begin] != -1] if network or stage not in _OF_THE_NETWORK else rows[:0]
@@ -101,6 +102,6 @@ class PlayTally:
                 durations[stage] = known[:, end] - known[:, begin]
         return durations
 
-    def latencies(self, *, network: bool, newest: int = KEPT_FRAMES) -> dict[str, LatencySummary]:
+    def latencies(self, *, network: bool, newest: int | None = None) -> dict[str, LatencySummary]:
         durations = self.durations_ns(network=network, newest=newest)
         return {stage: LatencySummary.of(taken.tolist()) for stage, taken in durations.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -98,7 +99,7 @@ def test_overload_is_answered_in_bounded_time(slow: float, begin: int, seed: int
 def test_it_never_hunts(loads: list[float], stays: int, seed: int) -> None:
     """Whatever the load does: 2 s at least lie before every step up, and a tier that fails again and again is tried ever more rarely."""
     machine = Machine(lambda number: loads[number // stays % len(loads)], seed=seed).run(40 * SECOND)
-    for before, after in zip(machine.switches, machine.switches[1:], strict=False):
+    for before, after in itertools.pairwise(machine.switches):
         if after.after < after.before:
             assert after.at_ns - before.at_ns >= HOLD_NS
         assert before.after == after.before != after.after
@@ -120,9 +121,9 @@ def test_a_tier_that_always_fails_is_tried_ever_more_rarely() -> None:
         switch = governor.shown(now_ns, latency_ns=upscale_ns + MS, busy_ns=upscale_ns + MS, upscale_ns=upscale_ns)
         if switch is not None and switch.after == 0:
             ups.append(switch.at_ns)
-    gaps = [b - a for a, b in zip(ups, ups[1:], strict=False)]
+    gaps = [b - a for a, b in itertools.pairwise(ups)]
     assert 5 <= len(ups) <= 15
-    assert all(b >= min(1.9 * a, MAX_HOLD_NS) for a, b in zip(gaps, gaps[1:], strict=False))
+    assert all(b >= min(1.9 * a, MAX_HOLD_NS) for a, b in itertools.pairwise(gaps))
 
 
 @settings(max_examples=25, deadline=None)
