@@ -122,7 +122,7 @@ class Governor:
 
     def _begin(self, now_ns: int) -> None:
         self._since_ns = now_ns
-        self._in_a_row = 0
+        self._in_a_row: int = 0
         self._latencies_ns: deque[int] = deque(maxlen=WINDOW_FRAMES)
         self._upscale_ns: deque[int] = deque(maxlen=WINDOW_FRAMES)
         self._besides_ns: deque[tuple[int, int]] = deque(maxlen=WINDOW_FRAMES)

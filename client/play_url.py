@@ -22,8 +22,7 @@ _BENEATH = "rtp,udp,tcp,tls,http,https,rtsp,rtsps"  # never file, pipe or concat
 _OPTIONS = {
     "protocol_whitelist": _BENEATH,
     "format_whitelist": f"{CONTAINERS},rtsp",  # no playlists: they name other addresses
-    "fflags": "nobuffer",
-    "analyzeduration": "1000000",
+    "analyzeduration": "1000000",  # what was read for it comes in a burst, of which the deadline rule shows the newest
 }
 _OPEN_S, _READ_S = 5.0, 5.0
 _RETRY_S = 1.0
