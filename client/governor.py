@@ -44,6 +44,7 @@ class Governor:
     def __init__(self, costs_ns: Sequence[int], *, deadline_ns: int, period_ns: int, now_ns: int) -> None:
         self.deadline_ns, self.period_ns = deadline_ns, period_ns
         self._costs_ns = costs_ns
+        self._in_a_row = 0
         self._hold_ns = [HOLD_NS] * len(costs_ns)
         self._not_before_ns = [now_ns + HOLD_NS] * len(costs_ns)
         fitting = [tier for tier, cost_ns in enumerate(costs_ns) if cost_ns <= START_SHARE * min(deadline_ns, period_ns)]
@@ -122,7 +123,7 @@ class Governor:
 
     def _begin(self, now_ns: int) -> None:
         self._since_ns = now_ns
-        self._in_a_row: int = 0
+        self._in_a_row = 0
         self._latencies_ns: deque[int] = deque(maxlen=WINDOW_FRAMES)
         self._upscale_ns: deque[int] = deque(maxlen=WINDOW_FRAMES)
         self._besides_ns: deque[tuple[int, int]] = deque(maxlen=WINDOW_FRAMES)

@@ -91,7 +91,10 @@ class PlayTally:
         return self.late + self.left_out
 
     def durations_ns(self, *, network: bool, newest: int | None = None) -> dict[str, NDArray[np.int64]]:
-        """By stage, of the `newest` frames, by default of all that are kept; with `network` also what only packets tell. Stages without any are left out."""
+        """By stage, of the `newest` frames, by default of all that are kept; with `network` also what only packets tell.
+
+        Stages without any are left out.
+        """
         kept = len(self._stamps)
         count = min(self.shown, kept, newest or kept)
         rows = self._stamps[np.arange(self.shown - count, self.shown) % kept]
