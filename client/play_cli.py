@@ -118,12 +118,9 @@ def play(arguments: argparse.Namespace, asked: Asked) -> PlaySummary:
     """Everything between the arguments and the summary. Raises GamesrError."""
     say, display = Say(), arguments.display
     with ExitStack() as stack:
-        tiers = TieredUpscaler(
-            [arguments.model] if arguments.model else arguments.tiers,
-            display_height=display and display[1],
-            provider=arguments.provider,
-            threads=arguments.threads,
-        )
+        names = [arguments.model] if arguments.model else arguments.tiers
+        height = display and display[1]
+        tiers = stack.enter_context(TieredUpscaler(names, display_height=height, provider=arguments.provider, threads=arguments.threads))
         sink: Sink = NullSink()
         window = file = None
         if arguments.sink == "window":

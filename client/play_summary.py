@@ -92,7 +92,7 @@ class PlaySummary:
             f"{self.source}: {self.ended}",
             f"  picture  {sizes}, x{spec.scale}; {tally.shown} frames shown in {self._seconds:.1f} s, {tally.damaged} damaged",
             f"  deadline {self.deadline_ns / 1e6:.1f} ms: {100 * self._kept:.2f}% kept; {tally.late} late, {tally.left_out} left out"
-            f"{f', {tally.unready} came before all was ready' if tally.unready else ''}",
+            f"{f', {tally.unready} came before all tiers were ready' if tally.unready else ''}",
             f"  freezes  {tally.freezes}, the longest gap {tally.longest_gap_ns / 1e6:.0f} ms",
             f"  tiers    {tiers} on {self.provider}, threads {self.threads}; {tally.switched} switches",
         ]

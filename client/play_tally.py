@@ -35,7 +35,8 @@ class PlayTally:
     """Counts of frames, and the stamps of the last 65,536 that were shown.
 
     `late` are shown frames that missed their deadline, `left_out` those that were not shown so that newer ones were in time,
-    `unready` those that came while the tiers were made ready. A freeze is a gap of more than three periods between two shown frames.
+    `unready` those that came while the tiers were made ready: the last tier showed them, if any did; nothing else counts them.
+    A freeze is a gap of more than three periods between two shown frames.
     """
 
     shown: int = 0

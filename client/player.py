@@ -60,7 +60,7 @@ class Player:
         try:
             if self._source.size is not None:
                 width, height = self._source.size
-                while not self._tiers.ready(height, width):
+                while not self._tiers.ready(height, width) or not self._tiers.complete:
                     self._idle()
                     time.sleep(0.01)
             for done in upscale_stream(self._in_time(), self._tiers, self._sink):
@@ -103,41 +103,53 @@ class Player:
                 tally.unready += 1
                 self._idle()
                 continue
-            now_ns = time.perf_counter_ns()
-            if self._size != (frame.width, frame.height) or self.governor is None:
-                self._begin(frame, now_ns)
-            governor, waiting = self.governor, self._source.waiting()
-            assert governor is not None
-            governor.deadline_ns, governor.period_ns = self.deadline_ns, self.period.ns
-            left_out = self._rule.leaves_out(
-                age_ns=now_ns - item.last_ns, waiting=waiting, frame_ns=governor.frame_ns, deadline_ns=governor.deadline_ns
-            )
-            if left_out:
-                tally.left_out += 1
-                self._follow(governor.left_out(now_ns, waiting=waiting))
+            now_ns, waiting = time.perf_counter_ns(), self._source.waiting()
+            if self._size != (frame.width, frame.height):
+                self._resize(frame)
+            if self.governor is None and self._tiers.complete:
+                self._begin(now_ns)
+            if self._leaves_out(now_ns - item.last_ns, waiting):
+                if self.governor is None:
+                    tally.unready += 1
+                else:
+                    tally.left_out += 1
+                    self._follow(self.governor.left_out(now_ns, waiting=waiting))
                 continue
             self._item = item
             self._decoded(frame)
             yield item
 
-    def _begin(self, frame: Frame, now_ns: int) -> None:
-        """A picture of another size, or the first."""
+    def _leaves_out(self, age_ns: int, waiting: int) -> bool:
+        governor = self.governor
+        frame_ns = self._tiers.costs_ns[-1] if governor is None else governor.frame_ns
+        if governor is not None:
+            governor.deadline_ns, governor.period_ns = self.deadline_ns, self.period.ns
+        return self._rule.leaves_out(age_ns=age_ns, waiting=waiting, frame_ns=frame_ns, deadline_ns=self.deadline_ns)
+
+    def _resize(self, frame: Frame) -> None:
+        """A picture of another size, or the first: the last tier shows it until all are ready."""
         tiers, before = self._tiers, self._size
-        self._size = frame.width, frame.height
+        self._size, self.governor = (frame.width, frame.height), None
         self.tally.sizes.append(self._size)
-        self.governor = Governor(tiers.costs_ns, deadline_ns=self.deadline_ns, period_ns=self.period.ns, now_ns=now_ns)
-        tier, scale = self.governor.tier, tiers.specs[0].scale
         if before is not None:
             self._tell("size", f"the picture is now {frame.width}x{frame.height}, it was {before[0]}x{before[1]}")
-            if tier != tiers.tier:
-                self.tally.switch(Switch(now_ns, tiers.tier, tier, "the picture changed size"))
-        tiers.tier = tier
-        sizes = f"{frame.width}x{frame.height} -> {scale * frame.width}x{scale * frame.height}"
-        self._tell("begin", f"{sizes} with {tiers.names[tier]}, {tiers.costs_ns[tier] / 1e6:.1f} ms a frame")
+        if not tiers.complete:
+            self._tell("unready", f"{tiers.names[-1]} shows it until all tiers are ready")
+
+    def _begin(self, now_ns: int) -> None:
+        """All tiers are ready: the best that fits is begun with."""
+        tiers = self._tiers
+        self.governor = Governor(tiers.costs_ns, deadline_ns=self.deadline_ns, period_ns=self.period.ns, now_ns=now_ns)
+        tiers.tier = self.governor.tier
+        costs = ", ".join(f"{name} {cost_ns / 1e6:.1f} ms" for name, cost_ns in zip(tiers.names, tiers.costs_ns, strict=True))
+        self._tell("begin", f"{tiers.names[tiers.tier]} x{tiers.specs[0].scale} is begun with ({costs})")
 
     def _account(self, done: FrameDone) -> None:
         item, governor, stamps = self._item, self.governor, done.stamps
-        assert item is not None and governor is not None
+        assert item is not None
+        if governor is None:
+            self.tally.unready += 1
+            return
         self.tally.add(item, done, tier=self._tiers.names[self._tiers.tier], deadline_ns=governor.deadline_ns, period_ns=self.period.ns)
         self._follow(
             governor.shown(

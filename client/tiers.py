@@ -5,6 +5,8 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
+from types import TracebackType
+from typing import Self
 
 import numpy as np
 
@@ -29,7 +31,7 @@ class TieredState:
 
 
 class TieredUpscaler:
-    """Models by name, the best first, each ready for the size of the stream; set `tier` to choose.
+    """Models by name, the best first, each made ready for the size of the stream; set `tier` to choose. A context manager.
 
     With the step after that, the chosen model's memory begins anew: no memory is used by another network, nor one that missed frames.
     All buffers are made by `prepare`, none by a switch. `display_height` chooses the scale, 2 or 3,
@@ -44,10 +46,16 @@ class TieredUpscaler:
         self.size: tuple[int, int] | None = None  # height and width that all is ready for
         self._display_height, self._threads = display_height, threads
         self._loaded: dict[int, list[OnnxUpscaler]] = {}
-        self._states: list[State] = []
+        self._states: dict[int, State] = {}
         self._running, self._stream = 0, 0
         self._preparation: _Preparation | None = None
         self._upscalers = self._load(2)  # what is missing or does not start is said at once
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
 
     @property
     def specs(self) -> list[ModelSpec]:
@@ -64,34 +72,48 @@ class TieredUpscaler:
         return min((2, 3), key=lambda scale: abs(scale * height - display_height))
 
     def ready(self, height: int, width: int) -> bool:
-        """Whether pictures of this size can be upscaled; getting ready for another size begins with the first question about it.
+        """Whether pictures of this size can be upscaled, with the last tier at least; the first question about a size begins that.
 
-        That runs in a thread, so that decoding goes on. Raises what it raised.
+        It runs in a thread, from the last tier to the first, so that decoding goes on. Raises what it raised.
         """
-        if self.size == (height, width):
+        if self.size == (height, width) and (self._preparation is None or self._preparation.size == self.size):
             return True
         if self._preparation is None or self._preparation.size != (height, width):
-            if self._preparation is not None:
-                self._preparation.join()  # one at a time: a stream cannot have more made by changing faster
+            self.close()  # one at a time: a stream cannot have more made by changing faster
             self._preparation = _Preparation(self, height, width)
             self._preparation.start()
-        if self._preparation.is_alive():
+        preparation = self._preparation
+        if not preparation.usable.is_set():
+            preparation.check()
             return False
-        preparation, self._preparation = self._preparation, None
-        if preparation.error is not None:
-            raise preparation.error
         self._upscalers, self._states, self.costs_ns = preparation.upscalers, preparation.states, preparation.costs_ns
-        self.size = height, width
+        self.size, self.tier = (height, width), len(self.names) - 1
         return True
 
+    @property
+    def complete(self) -> bool:
+        """Whether every tier can be chosen, and has been timed; until then it is the last one. Raises as `ready` does."""
+        if self._preparation is not None and not self._preparation.is_alive():
+            self._preparation.check()
+            self._preparation = None
+        return self._preparation is None
+
     def prepare(self, height: int, width: int) -> None:
-        """Wait until it is `ready`."""
-        while not self.ready(height, width):
+        """Wait until all is ready."""
+        while not self.ready(height, width) or not self.complete:
             time.sleep(0.01)
+
+    def close(self) -> None:
+        """Wait for the thread, which ends with the tier that it is at."""
+        if self._preparation is not None:
+            self._preparation.stop = True
+            self._preparation.join()
+            self._preparation = None
 
     def initial_state(self, height: int, width: int) -> TieredState:
         """An empty memory; one that was given before is worth nothing any more."""
-        self.prepare(height, width)
+        while not self.ready(height, width):
+            time.sleep(0.01)
         self._stream += 1
         self._begin_again()
         return TieredState(height, width, self._stream, restarted=False)
@@ -121,31 +143,37 @@ class TieredUpscaler:
 
 
 class _Preparation(threading.Thread):
-    """Makes each tier's buffers for a size, has it run and times it."""
+    """Makes each tier's buffers for a size, has it run and times it; the lists are filled as it goes."""
 
     def __init__(self, tiers: TieredUpscaler, height: int, width: int) -> None:
         super().__init__(name="tiers", daemon=True)
         self.size = height, width
-        self.error: GamesrError | None = None
+        self.stop = False
+        self.usable = threading.Event()
         self.upscalers: list[OnnxUpscaler] = []
-        self.states: list[State] = []
-        self.costs_ns: list[int] = []
+        self.states: dict[int, State] = {}
+        self.costs_ns = [0] * len(tiers.names)
+        self._error: GamesrError | None = None
         self._tiers = tiers
 
     def run(self) -> None:
         try:
-            height, width = self.size
-            self.upscalers = self._tiers._load(self._tiers.scale(height))
-            for upscaler in self.upscalers:
-                state, cost_ns = _timed(upscaler, height, width)
-                self.states.append(state)
-                self.costs_ns.append(cost_ns)
+            self.upscalers = self._tiers._load(self._tiers.scale(self.size[0]))
+            for tier in reversed(range(len(self.upscalers))):
+                if self.stop:
+                    break
+                self.states[tier], self.costs_ns[tier] = _timed(self.upscalers[tier], *self.size)
+                self.usable.set()
         except GamesrError as error:
-            self.error = error
+            self._error = error
+
+    def check(self) -> None:
+        if self._error is not None:
+            raise self._error
 
 
 def _timed(upscaler: OnnxUpscaler, height: int, width: int) -> tuple[State, int]:
-    """The buffers that frames of this size are computed in, and the median time that one takes."""
+    """The buffers that frames of this size are computed in, and the least time that one took: others may be playing meanwhile."""
     grey = [np.full(shape, 128, np.uint8) for shape in plane_shapes(height, width)]
     frame, state = Frame(grey[0], grey[1], grey[2]), upscaler.initial_state(height, width)
     durations_ns = []
@@ -153,4 +181,4 @@ def _timed(upscaler: OnnxUpscaler, height: int, width: int) -> tuple[State, int]
         begin_ns = time.perf_counter_ns()
         _, state = upscaler.step(frame, state)
         durations_ns.append(time.perf_counter_ns() - begin_ns)
-    return state, sorted(durations_ns[2:])[TIMED_FRAMES // 2]
+    return state, min(durations_ns[2:])
