@@ -50,6 +50,8 @@ class DeadlineRule:
         if not waiting or age_ns + (1 + waiting) * frame_ns <= deadline_ns:
             self._in_a_row, self._most = 0, MOST_LEFT_OUT
             return False
+        if not self._in_a_row:
+            self._most = min(max(self._most, 2 * waiting), RAREST)
         self._in_a_row += 1
         if self._in_a_row <= self._most:
             return True

@@ -31,7 +31,7 @@ from client.video import MAX_SIDE
 
 PROGRAM = "gamesr-play"
 TIERS = "gamesr,live,bicubic"
-SAY_INTERVAL_S = 1.0
+MIN_QUIET_S, MAX_QUIET_S = 1.0, 60.0
 EXAMPLES = """\
 examples:
   gamesr-play 127.0.0.1:5004
@@ -167,17 +167,22 @@ class Asked:
 
 
 class Say:
-    """A line on stderr for what happens to a stream, of each kind at most one a second; all are counted."""
+    """A line on stderr for what happens to a stream; all are counted.
+
+    Of each kind at most one a second, and while it goes on happening ever fewer, down to one a minute.
+    """
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self._said: dict[str, float] = {}
+        self._said: dict[str, tuple[float, float]] = {}  # when, and how long nothing follows
 
     def __call__(self, kind: str, sentence: str) -> None:
         self.counts[kind] += 1
         now = time.monotonic()
-        if now - self._said.get(kind, -SAY_INTERVAL_S) >= SAY_INTERVAL_S:
-            self._said[kind] = now
+        at, quiet_s = self._said.get(kind, (-MAX_QUIET_S, MIN_QUIET_S))
+        if now - at >= quiet_s:
+            again = now - at < 2 * quiet_s
+            self._said[kind] = now, min(2 * quiet_s, MAX_QUIET_S) if again else MIN_QUIET_S
             print(f"{PROGRAM}: {sentence}", file=sys.stderr, flush=True)
 
 

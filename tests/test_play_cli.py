@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -304,6 +304,29 @@ def test_a_summary_is_posted_as_the_service_takes_it(play: Play, make_clip: Make
             post_summary(url, {})
 
 
+def test_a_window_is_a_sink_like_another(play: Play, make_clip: MakeClip, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keys: the overlay, the wipe with bicubic, and the end."""
+    pytest.importorskip("sdl2")
+    from client import window
+    from client.window import Action, Window
+
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    pressed = [[], [Action.OVERLAY], [], [Action.WIPE], [], [], [Action.WIPE], [], [Action.QUIT]]
+    seen: list[tuple[tuple[int, int], bool, int]] = []
+
+    def present(self: Window, shown: Frame, *, left: Frame | None = None, overlay: Sequence[str] = ()) -> None:
+        assert left is None or left.y.shape == shown.y.shape
+        seen.append((shown.y.shape, left is not None, len(overlay)))
+
+    monkeypatch.setattr(window.Window, "present", present)
+    monkeypatch.setattr(window.Window, "actions", lambda self: pressed.pop(0) if pressed and len(seen) > 9 - len(pressed) else [])
+    status, out, errors = play(make_clip(frames=40), "--sink", "window", "--json")
+    assert status == 0, errors
+    assert json.loads(out)["ended"] == "the window was closed"
+    assert {size for size, _, _ in seen} == {(2 * HEIGHT, 2 * WIDTH)}
+    assert {wiped for _, wiped, _ in seen} == {False, True} and not seen[-1][1] and seen[0][2] == 0 and seen[-1][2] >= 6
+
+
 def test_urls_are_shown_without_secrets() -> None:
     assert shown_url("rtsp://me:secret@example.org:8554/game?token=x#y") == "rtsp://example.org:8554/game"
 
@@ -314,3 +337,20 @@ def test_the_lines_of_the_docs_are_ours() -> None:
     assert len(lines) >= 4
     for _, *arguments in lines:
         play_cli.parser().parse_args(arguments)
+
+
+def test_what_goes_on_happening_is_said_ever_more_rarely(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 1000.0
+    monkeypatch.setattr("client.play_cli.time.monotonic", lambda: now)
+    say = play_cli.Say()
+    for _ in range(6000):
+        say("overflow", "again")
+        now += 0.1
+    say("size", "another")
+    lines = capsys.readouterr().err.splitlines()
+    assert 8 <= lines.count("gamesr-play: again") <= 18 and lines[-1] == "gamesr-play: another" and say.counts["overflow"] == 6000
+    now += 600
+    for _ in range(2):
+        say("overflow", "again")
+        now += 1.1
+    assert len(capsys.readouterr().err.splitlines()) == 2

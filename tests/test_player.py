@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -13,6 +14,7 @@ from typing import Self
 import numpy as np
 import pytest
 
+import client.tiers
 from client.errors import InputError, ModelError
 from client.frames import Frame
 from client.play_source import Arrived, Idle
@@ -20,7 +22,7 @@ from client.play_tally import PlayTally
 from client.player import Player
 from client.sink import NullSink
 from client.tiers import TieredUpscaler
-from client.upscaler import OnnxUpscaler
+from client.upscaler import OnnxUpscaler, State
 from tests.moving import picture
 from tests.streaming import planes
 
@@ -130,7 +132,7 @@ def test_even_then_the_picture_moves(tiers: TieredUpscaler) -> None:
     sink = Kept()
     playing, _ = player(Script(moving(40), waits=dict.fromkeys(range(40), 5), age_ns=50_000_000), tiers, sink, deadline_ns=1_000_000)
     playing.play()
-    assert [frame.pts for frame in sink.pictures] == [8, 25]
+    assert [frame.pts for frame in sink.pictures] == [10, 31]  # after twice the five, and twice that again
 
 
 @pytest.mark.parametrize(("before", "after"), [(0, 1), (1, 0), (0, 2), (2, 0), (2, 1)])
@@ -218,6 +220,40 @@ def test_it_ends_when_it_is_told_to(tiers: TieredUpscaler) -> None:
     answers = iter([None, None, "enough"])
     playing, _ = player(Script(moving(3), idles=10**9), tiers, NullSink(), over=lambda: next(answers))
     assert playing.play() == "enough" and playing.tally.shown == 3
+
+
+def test_the_last_tier_shows_it_until_all_are_ready(model_file: ModelFile, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those frames are in no latency; what the governor begins with comes after them."""
+    gate = threading.Event()
+    timed = client.tiers._timed
+
+    def slowly(upscaler: OnnxUpscaler, height: int, width: int) -> tuple[State, int]:
+        if upscaler.spec.state:
+            assert gate.wait(60)
+        return timed(upscaler, height, width)
+
+    monkeypatch.setattr("client.tiers._timed", slowly)
+    files = [str(model_file("a.onnx")), str(model_file("c.onnx", stateful=False))]
+    sink = Kept()
+    with TieredUpscaler(files, display_height=None, provider="cpu", threads=1) as tiers:
+        while not tiers.ready(32, 48):
+            time.sleep(0.01)
+
+        class Opening(Script):
+            def frames(self, idle: Idle) -> Iterator[Arrived]:
+                for item in super().frames(idle):
+                    if item.frame.pts == 4:
+                        gate.set()
+                        tiers.prepare(32, 48)
+                    yield item
+
+        playing, told = player(Opening(moving(9)), tiers, sink)
+        playing.play()
+    assert (playing.tally.unready, playing.tally.shown, len(sink.pictures)) == (4, 5, 9)
+    assert told.kinds() == ["unready", "begin"]
+    plain = OnnxUpscaler(Path(files[1]), threads=1)
+    for frame, shown in zip(moving(4), sink.pictures, strict=False):
+        assert planes(plain.step(frame, plain.initial_state(32, 48))[0]) == planes(shown)
 
 
 def test_nothing_shown_is_said(tiers: TieredUpscaler) -> None:
