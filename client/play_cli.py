@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import os
 import re
@@ -146,6 +147,9 @@ def play(arguments: argparse.Namespace, asked: Asked) -> PlaySummary:
             decoded=window.follow if window else lambda frame: None,
         )
         lines = OverlayLines(player, source, tiers)
+        gc.collect()
+        gc.freeze()  # searching all that the libraries made takes tens of milliseconds, in the middle of the stream
+        stack.callback(gc.unfreeze)
         ended = player.play()
         if file:
             file.period_ns = player.period.ns
