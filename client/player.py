@@ -15,6 +15,8 @@ from client.play_summary import PlaySummary
 from client.play_tally import PlayTally
 from client.tiers import TieredUpscaler
 
+_READY = "all tiers are ready"
+
 
 class _Over(Exception):
     """The player was told to end while nothing came."""
@@ -50,6 +52,8 @@ class Player:
         self._rule = DeadlineRule()
         self._size: tuple[int, int] | None = None
         self._item: Arrived | None = None
+        self._shown_tier: int | None = None
+        self._why = _READY  # another tier than before shows the next frame, where that is not the governor's doing
 
     @property
     def deadline_ns(self) -> int:
@@ -132,6 +136,7 @@ class Player:
         self._size, self.governor = (frame.width, frame.height), None
         self.tally.sizes.append(self._size)
         if before is not None:
+            self._why = "the picture changed size"
             self._tell("size", f"the picture is now {frame.width}x{frame.height}, it was {before[0]}x{before[1]}")
         if not tiers.complete:
             self._tell("unready", f"{tiers.names[-1]} shows it until all tiers are ready")
@@ -147,6 +152,10 @@ class Player:
     def _account(self, done: FrameDone) -> None:
         item, governor, stamps = self._item, self.governor, done.stamps
         assert item is not None
+        if self._shown_tier not in (None, self._tiers.tier):
+            self.tally.switch(Switch(stamps.written_ns, self._shown_tier or 0, self._tiers.tier, self._why))
+            self._why = _READY
+        self._shown_tier = self._tiers.tier
         if governor is None:
             self.tally.unready += 1
             return
@@ -162,7 +171,7 @@ class Player:
 
     def _follow(self, switch: Switch | None) -> None:
         if switch is not None:
-            self._tiers.tier = switch.after
+            self._tiers.tier = self._shown_tier = switch.after
             self.tally.switch(switch)
             names = self._tiers.names
             self._tell("switch", f"{names[switch.before]} -> {names[switch.after]}: {switch.reason}")

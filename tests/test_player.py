@@ -251,6 +251,7 @@ def test_the_last_tier_shows_it_until_all_are_ready(model_file: ModelFile, monke
         playing.play()
     assert (playing.tally.unready, playing.tally.shown, len(sink.pictures)) == (4, 5, 9)
     assert told.kinds() == ["unready", "begin"]
+    assert [(s.before, s.after, s.reason) for s in playing.tally.switches] == [(1, 0, "all tiers are ready")]
     plain = OnnxUpscaler(Path(files[1]), threads=1)
     for frame, shown in zip(moving(4), sink.pictures, strict=False):
         assert planes(plain.step(frame, plain.initial_state(32, 48))[0]) == planes(shown)
