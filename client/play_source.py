@@ -140,6 +140,7 @@ class FileSource:
         self.name = str(path)
         self.size: tuple[int, int] | None = (self._video.width, self._video.height)
         self._tell = tell
+        self._period_ns = int(1_000_000_000 / self._video.frame_rate)
         self._next_due_ns: int | None = None
 
     def __enter__(self) -> Self:
@@ -153,7 +154,8 @@ class FileSource:
         return self._video.decode_errors
 
     def waiting(self) -> int:
-        return int(self._next_due_ns is not None and self._next_due_ns <= time.perf_counter_ns())
+        late_ns = -1 if self._next_due_ns is None else time.perf_counter_ns() - self._next_due_ns
+        return 0 if late_ns < 0 else 1 + late_ns // self._period_ns
 
     def frames(self, idle: Idle) -> Iterator[Arrived]:
         timed = self._timed()
@@ -166,16 +168,17 @@ class FileSource:
                 idle()
                 time.sleep(max(0.0, min((due_ns - time.perf_counter_ns()) / 1e9, IDLE_S)))
             if -left_ns > _BEHIND_NS:
-                self._tell("slow", f"decoding is {-left_ns / 1e9:.1f} s behind: the file slows down")
+                self._tell("slow", f"the file is {-left_ns / 1e9:.1f} s behind: it slows down")
                 begin_ns -= left_ns
                 due_ns -= left_ns
-            self._next_due_ns = None if following is None else begin_ns + following[0]
+            # The last packet is empty: it has the decoder give up what it holds, and is no newer picture.
+            self._next_due_ns = begin_ns + following[0] if following is not None and following[1].size else None
             for frame in self._video.decode(packet):
                 yield Arrived(frame.frame, frame.packet_ns, frame.decoded_ns, due_ns, due_ns, due_ns, None)
 
     def _timed(self) -> Iterator[tuple[int, av.Packet[VideoStream]]]:
         """Each packet with its time from the first one's, which never goes back and never leaps."""
-        period_ns = int(1_000_000_000 / self._video.frame_rate)
+        period_ns = self._period_ns
         tick_ns = 1_000_000_000 * Fraction(self._video.time_base)
         at_ns, last_dts = -period_ns, None
         for packet in self._video.packets():

@@ -196,6 +196,21 @@ def test_a_file_arrives_in_real_time(make_clip: MakeClip) -> None:
     assert arrivals == sorted(arrivals) and arrivals[-1] - arrivals[0] >= (FRAMES - 4) * 1_000_000_000 // 30
 
 
+def test_a_file_that_is_played_too_slowly_waits_and_then_slows_down(make_clip: MakeClip, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many wait as are due; it does not run after a lost second."""
+    monkeypatch.setattr("client.play_source._BEHIND_NS", 200_000_000)
+    told, waited, clip = Told(), [], make_clip()
+    with FileSource(clip, tell=told) as source:
+        items = []
+        for item in source.frames(lambda: None):
+            items.append(item)
+            if len(items) == 1:
+                time.sleep(0.5)
+            waited.append(source.waiting())
+    assert len(items) == FRAMES and waited[0] >= 14 and "slow" in told.kinds() and waited[-1] == 0
+    assert [planes(item.frame) for item in items] == [planes(frame) for frame in read_frames(clip)]
+
+
 def test_the_defaults_of_an_address(make_clip: MakeClip) -> None:
     with RtpSource(Session((LOOPBACK, 0)), until_bye=True, tell=Told()) as taken:
         port = taken._receiver.address[1]
