@@ -40,7 +40,7 @@ class AccessUnit:
     first and last packet; `sent_ns` is when the first of them was sent, on that same clock, and is true only where sender
     and receiver share a wall clock (None without abs-send-time). `lost_packets` are missing between the last packet of the
     unit before and the last of this one. `whole` says that nothing of this unit can be missing, `restarted` that it is the
-    first of a sender. `damaged` is what the loss rule says (client.loss).
+    first of a sender. `damaged` is what the loss rule says (client.loss), `ready_ns` when a receiver queued it; 0 before.
     """
 
     data: bytes
@@ -54,6 +54,7 @@ class AccessUnit:
     restarted: bool
     content: Content
     damaged: bool = True
+    ready_ns: int = 0
 
 
 class Assembler:

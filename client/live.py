@@ -49,6 +49,11 @@ class LiveDecoder:
         self._waiting: dict[int, tuple[AccessUnit, bool]] = {}
         self._delay: int | None = None  # units that wait after a picture came out: the stream's own reordering
 
+    @property
+    def begun(self) -> bool:
+        """Whether the present sender has shown something to begin with: an IDR or a recovery point."""
+        return self._rule.begun
+
     def decode(self, unit: AccessUnit) -> list[Received]:
         """The frames that this unit completes: its own, unless the stream reorders."""
         damaged = self._rule.admit(unit)

@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from collections import deque
+from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
@@ -62,6 +63,11 @@ class RtpReceiver:
             self._changed.wait_for(lambda: self._units or self._closed, timeout_s)
             return self._units.popleft() if self._units else None
 
+    @property
+    def waiting(self) -> int:
+        """How many access units are there to be taken."""
+        return len(self._units)
+
     def request_keyframe(self) -> None:
         """Ask the sender for an IDR: the decoder cannot go on by itself. At most ten a second are sent."""
         with self._changed:
@@ -113,7 +119,8 @@ class RtpReceiver:
                 reception.lose(len(self._units) + len(units))  # the new ones too: they were judged before this loss
                 self._units.clear()
             else:
-                self._units += units
+                ready_ns = time.perf_counter_ns()
+                self._units += [replace(unit, ready_ns=ready_ns) for unit in units]
             if units:
                 self._changed.notify_all()
             feedback, sender = reception.feedback(now_ns), reception.sender

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from client.artifact import ModelSpec
 from client.quality import Quality
-from client.timing import Stamps, stage_latencies
+from client.timing import LatencySummary, Stamps, stage_latencies
 
 _QUALITY_COLUMNS = {
     "PSNR-Y dB": "psnr_y_db",
@@ -90,10 +90,7 @@ class Summary:
             lines.append(f"  skipped  {100 * self.skipped_share:.1f}% of the tiles, which had not changed")
         if self.network_share is not None:
             lines.append(f"  network  on {100 * self.network_share:.1f}% of the picture, where most detail is; bicubic elsewhere")
-        lines.append(f"  {'latency, ms':<12}" + "".join(f"{head:>10}" for head in ("p50", "p95", "p99", "max")))
-        for stage, latency in stage_latencies(self.stamps).items():
-            values = (latency.p50, latency.p95, latency.p99, latency.max)
-            lines.append(f"    {stage:<10}" + "".join(f"{value / 1000:>10.2f}" for value in values))
+        lines += latency_table(stage_latencies(self.stamps))
         if self.quality:
             lines.append(f"  {'quality':<12}" + "".join(f"{head:>10}" for head in _QUALITY_COLUMNS))
             lines += [f"    {name:<10}" + _quality_cells(quality) for name, quality in self.quality.items()]
@@ -109,6 +106,15 @@ class Summary:
                 if head not in heads:
                     heads.append(head)
         return [f"no {', '.join(heads)}: {reason}" for reason, heads in missing.items()]
+
+
+def latency_table(latencies: Mapping[str, LatencySummary]) -> list[str]:
+    """A line a stage, in milliseconds, below a head."""
+    lines = [f"  {'latency, ms':<12}" + "".join(f"{head:>10}" for head in ("p50", "p95", "p99", "max"))]
+    for stage, latency in latencies.items():
+        values = (latency.p50, latency.p95, latency.p99, latency.max)
+        lines.append(f"    {stage:<10}" + "".join(f"{value / 1000:>10.2f}" for value in values))
+    return lines
 
 
 def _quality_cells(quality: Quality) -> str:

@@ -82,6 +82,12 @@ class OnnxUpscaler:
             )
         return State(_StreamBuffers(self._runtime, self.spec, height, width), 0, restarted=False)
 
+    def begin_again(self, state: State) -> State:
+        """An empty memory in the buffers of `state`, which is consumed: a stream that begins anew while it is played needs no new ones."""
+        buffers, current = state._take()
+        buffers.clear(current)
+        return State(buffers, current, restarted=False)
+
     def state_of(self, height: int, width: int, tensors: Sequence[np.ndarray]) -> State:
         """The memory that `State.tensors` gave out, or one like it, for frames of `height` x `width` pixels."""
         state = self.initial_state(height, width)

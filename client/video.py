@@ -40,23 +40,23 @@ class Decoded:
     decoded_ns: int
 
 
-class VideoSource:
-    """The video stream of a local file; a context manager, iterated once for its frames in order of presentation.
+class OpenVideo:
+    """The video stream of a container that is open; a context manager, iterated once for its frames in order of presentation.
 
     Frames come out as 8-bit 4:2:0 (see `from_av_frame`), sliced threads and low_delay: nothing waits for a later packet
     unless the stream reorders. A packet that cannot be decoded is counted in `decode_errors` and decoding goes on; from
     there to the next key frame the frames are marked damaged. `announced_frames` is what the container says it holds, and
     `estimated_frames` that or its duration times its frame rate; None where it says neither.
 
-    Raises InputError, in one sentence, for what is not a local video file and for pictures that are not supported:
+    Raises InputError, in one sentence that begins with `name`, for what holds no video and for pictures that are not supported:
     interlaced, larger than 8192x8192, or of another pixel format.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, name: str, container: InputContainer) -> None:
+        self.name = name
         self.decode_errors = 0
         self.display_matrix: tuple[int, ...] | None = None  # known with the first frame
-        self._container = open_local(path)
+        self._container = container
         try:
             self._stream = self._video_stream()
         except BaseException:
@@ -83,20 +83,28 @@ class VideoSource:
         self._container.close()
 
     def __iter__(self) -> Iterator[Decoded]:
-        for packet in self._packets():
-            packet_ns = time.perf_counter_ns()
-            try:
-                pictures = packet.decode()
-            except av.FFmpegError:
-                self.decode_errors += 1
-                self._damaged = True
-                continue
-            for picture in pictures:
-                frame = self._frame(picture)
-                yield Decoded(frame, packet_ns, time.perf_counter_ns())
-                packet_ns = time.perf_counter_ns()  # a second frame of the same packet did not wait while the first was used
+        for packet in self.packets():
+            yield from self.decode(packet)
 
-    def _packets(self) -> Iterator[av.Packet[VideoStream]]:
+    def decode(self, packet: av.Packet[VideoStream]) -> Iterator[Decoded]:
+        """The frames that one of `packets` completes."""
+        packet_ns = time.perf_counter_ns()
+        try:
+            pictures = packet.decode()
+        except av.FFmpegError:
+            self.decode_errors += 1
+            self._damaged = True
+            return
+        for picture in pictures:
+            frame = self._frame(picture)
+            yield Decoded(frame, packet_ns, time.perf_counter_ns())
+            packet_ns = time.perf_counter_ns()  # a second frame of the same packet did not wait while the first was used
+
+    def distrust(self) -> None:
+        """A packet was thrown away: what comes is damaged until the next key frame."""
+        self._damaged = True
+
+    def packets(self) -> Iterator[av.Packet[VideoStream]]:
         """Packets with something in them, then one empty one: it flushes the decoder, and any other would end it early."""
         packets = self._container.demux(self._stream)
         while True:
@@ -115,8 +123,8 @@ class VideoSource:
 
     def _frame(self, picture: av.VideoFrame) -> Frame:
         if picture.interlaced_frame:
-            raise InputError(f"{self.path} is interlaced, which is not supported: deinterlace it first")
-        _check_size(self.path, picture.width, picture.height)
+            raise InputError(f"{self.name} is interlaced, which is not supported: deinterlace it first")
+        _check_size(self.name, picture.width, picture.height)
         if not self._begun:  # of later ones too it would make a cycle of references, which keeps pictures until a garbage collection
             self._begun = True
             self.display_matrix = _display_matrix(picture)
@@ -130,18 +138,26 @@ class VideoSource:
         stream = self._container.streams.best("video")  # not a cover picture where there is a video
         if not isinstance(stream, VideoStream):
             kinds = ", ".join(sorted({stream.type for stream in self._container.streams})) or "no stream"
-            raise InputError(f"{self.path} has no video stream ({kinds} only)")
+            raise InputError(f"{self.name} has no video stream ({kinds} only)")
         if stream.codec_context is None:
-            raise InputError(f"{self.path} has a video stream of a codec that cannot be decoded")
+            raise InputError(f"{self.name} has a video stream of a codec that cannot be decoded")
         context = stream.codec_context
         if not context.width or not context.height:
-            raise InputError(f"{self.path} holds no video frame that can be decoded")
-        _check_size(self.path, context.width, context.height)
+            raise InputError(f"{self.name} holds no video frame that can be decoded")
+        _check_size(self.name, context.width, context.height)
         if context.pix_fmt is not None:
             _check_format(context.pix_fmt)
         if context.field_order not in _PROGRESSIVE:
-            raise InputError(f"{self.path} is interlaced, which is not supported: deinterlace it first")
+            raise InputError(f"{self.name} is interlaced, which is not supported: deinterlace it first")
         return stream
+
+
+class VideoSource(OpenVideo):
+    """The video stream of a local file; raises InputError as well for what is none."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        super().__init__(str(path), open_local(path))
 
 
 def open_local(path: Path) -> InputContainer:
@@ -223,9 +239,9 @@ def _display_matrix(picture: av.VideoFrame) -> tuple[int, ...] | None:
     return None if matrix is None else tuple(np.frombuffer(memoryview(matrix), np.int32).tolist())
 
 
-def _check_size(path: Path, width: int, height: int) -> None:
+def _check_size(name: str, width: int, height: int) -> None:
     if max(width, height) > MAX_SIDE:
-        raise InputError(f"{path} is {width}x{height}: pictures larger than {MAX_SIDE}x{MAX_SIDE} are not supported")
+        raise InputError(f"{name} is {width}x{height}: pictures larger than {MAX_SIDE}x{MAX_SIDE} are not supported")
 
 
 def _check_format(name: str) -> None:

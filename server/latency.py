@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import platform
-import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -13,7 +11,7 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
-from client.cores import physical_cores
+from client.cores import machine_name, physical_cores
 from client.errors import InputError
 from client.measurement import WARM_UP_FRAMES, Task, in_fresh_process, measure
 from client.timing import Stamps, deadline_misses, stage_latencies
@@ -76,13 +74,6 @@ def measure_latency(ask: Ask, stream: Stream) -> LatencyResult:
         latency_us=stages,
         deadline_misses={fps: deadline_misses(totals_ns, fps) for fps in DEADLINES_FPS},
     )
-
-
-def machine_name() -> str:
-    """The processor's name where the system tells it, else its kind."""
-    cpuinfo = Path("/proc/cpuinfo")
-    found = re.search(r"^model name\s*:\s*(.+)$", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.is_file() else None
-    return found[1] if found else platform.processor() or platform.machine()
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-RUNTIME = {"numpy", "av", "onnxruntime", "imageio_ffmpeg", "aiortc"}
+RUNTIME = {"numpy", "av", "onnxruntime", "imageio_ffmpeg", "aiortc", "sdl2"}
 WORKSHOP = {"torch", "onnx", "tqdm", "matplotlib"}
 HARNESS = {"distributed", "bjontegaard", "matplotlib"}
 SERVICE = {"fastapi", "starlette", "pydantic", "uvicorn", "prometheus_client", "anyio"}

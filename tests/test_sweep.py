@@ -13,6 +13,7 @@ import pytest
 
 import server.job
 from client.cloud import CloudEncoder, CloudSettings, area_downscale, through_codec
+from client.cores import machine_name
 from client.frames import Frame
 from client.models import find_model
 from client.quality import Quality, QualityMeter
@@ -20,7 +21,6 @@ from client.upscaler import OnnxUpscaler
 from client.video import read_frames
 from server.encoding import clip_frames
 from server.events import LatencyDone, LatencyReused, PlanMade, PointDone, PointFailed, Waiting, event_record
-from server.latency import machine_name
 from server.points import DEADLINES_FPS, Flag, LatencyResult, Point, PointResult
 from server.store import Store
 from server.sweep import run_sweep

@@ -1,0 +1,138 @@
+"""Where a player's pictures go besides a window: nowhere, or into a .y4m file; in the size of a display, where one was named."""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+from collections.abc import Iterator
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, Self
+
+import av
+from av.video.reformatter import Interpolation, VideoReformatter
+
+from client.errors import OutputError
+from client.frames import Frame, Plane
+from client.pipeline import Sink
+from client.video import from_av_frame, plane_view
+
+FULL_RANGE = 2  # AVColorRange
+_RATE_DIGITS = 7
+_GREATEST_RATE = 10**_RATE_DIGITS - 1
+
+
+class Resizer:
+    """A picture to `width` x `height`, bicubic by swscale: planes to planes; time, tags and damage are kept.
+
+    swscale takes chroma as centred: what is left-sited comes out a sixth of a luma sample off at 1.5 times the size.
+    """
+
+    def __init__(self, width: int, height: int) -> None:
+        self._width, self._height = width, height
+        self._scaler = VideoReformatter()
+        self._source = av.VideoFrame(width, height, "yuv420p")
+
+    def resize(self, frame: Frame) -> Frame:
+        if (frame.width, frame.height) == (self._width, self._height):
+            return frame
+        if (self._source.width, self._source.height) != (frame.width, frame.height):
+            self._source = av.VideoFrame(frame.width, frame.height, "yuv420p")
+        for plane, values in zip(self._source.planes, (frame.y, frame.u, frame.v), strict=True):
+            plane_view(plane)[:] = values
+        resized = self._scaler.reformat(self._source, self._width, self._height, "yuv420p", interpolation=Interpolation.BICUBIC)
+        planes = from_av_frame(resized)
+        return replace(frame, y=planes.y, u=planes.u, v=planes.v)
+
+
+class ResizingSink:
+    """Hands pictures on in one size."""
+
+    def __init__(self, sink: Sink, width: int, height: int) -> None:
+        self._sink, self._resizer = sink, Resizer(width, height)
+
+    def write(self, frame: Frame) -> None:
+        self._sink.write(self._resizer.resize(frame))
+
+
+class Y4mSink:
+    """Uncompressed pictures in .y4m, the size of the first; a context manager. Later ones of another size are resized.
+
+    The file appears whole when the block ends, and not at all when an exception ends it. It holds what was shown, one after the other:
+    set `period_ns` before the end to say at what rate. Raises OutputError, in one sentence.
+    """
+
+    def __init__(self, path: Path, *, force: bool = False) -> None:
+        self.path, self.period_ns = path, 1_000_000_000 // 60
+        self._force = force
+        if path.exists() and (not force or not path.is_file()):
+            reason = "name another file, or replace it with --force" if path.is_file() else "it is not a file"
+            raise OutputError(f"cannot write {path}, which exists: {reason}")
+        if not path.parent.is_dir():
+            raise OutputError(f"cannot write {path}: the folder {path.parent} does not exist")
+        self._partial = path.with_name(f".{path.name[:64]}.{secrets.token_hex(4)}.part")
+        self._file: BinaryIO | None = None
+        self._first: Frame | None = None
+        self._size = 0, 0
+        self._resizer: Resizer | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        try:
+            if self._file is not None and self._first is not None and kind is None:
+                with self._as_sentence():
+                    self._file.seek(0)
+                    self._file.write(self._header(self._first))
+                    self._file.close()
+                    if self.path.exists() and not self._force:
+                        raise OutputError(f"{self.path} has appeared while it was being made: name another file, or use --force")
+                    self._partial.replace(self.path)
+        finally:
+            if self._file is not None:
+                with contextlib.suppress(OSError):
+                    self._file.close()
+            self._partial.unlink(missing_ok=True)
+
+    def write(self, frame: Frame) -> None:
+        with self._as_sentence():
+            if self._file is None or self._resizer is None:
+                self._file = self._partial.open("xb", buffering=0)
+                self._resizer = Resizer(frame.width, frame.height)
+                self._first = replace(frame, y=frame.y[:1], u=frame.u[:1], v=frame.v[:1])
+                self._size = frame.width, frame.height
+                self._write(self._header(frame))
+            frame = self._resizer.resize(frame)
+            self._write(b"FRAME\n")
+            for plane in (frame.y, frame.u, frame.v):
+                self._write_plane(plane)
+
+    def _write_plane(self, plane: Plane) -> None:
+        if plane.flags.c_contiguous:
+            self._write(plane.data)
+        else:
+            self._write(plane.tobytes())
+
+    def _write(self, data: bytes | memoryview) -> None:
+        assert self._file is not None
+        view = memoryview(data).cast("B")
+        while view:  # an unbuffered file may take a part
+            view = view[self._file.write(view) :]
+
+    def _header(self, frame: Frame) -> bytes:
+        """Of one length whatever the rate, so that it can be written again at the end; 4:2:0 as MPEG-2 and H.264 site it."""
+        width, height = self._size
+        rate = min(Fraction(1_000_000_000, max(1, self.period_ns)).limit_denominator(1001), Fraction(_GREATEST_RATE))
+        colours = "FULL" if frame.colour.range == FULL_RANGE else "LIMITED"
+        numbers = f"F{rate.numerator:0{_RATE_DIGITS}}:{rate.denominator:0{_RATE_DIGITS}}"
+        return f"YUV4MPEG2 W{width} H{height} {numbers} Ip A1:1 C420mpeg2 XCOLORRANGE={colours}\n".encode()
+
+    @contextlib.contextmanager
+    def _as_sentence(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise OutputError(f"cannot write {self.path}: {error.strerror}") from error

@@ -1,0 +1,184 @@
+"""Several models as one upscaler of one stream, of which the one that a governor chose computes the next frame."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from client.artifact import ModelSpec
+from client.errors import GamesrError, ModelError
+from client.frames import Frame
+from client.models import find_model
+from client.upscaler import OnnxUpscaler, State, plane_shapes
+
+TIMED_FRAMES = 5
+
+
+class TieredState:
+    """What a `TieredUpscaler` hands from frame to frame; the memory itself is the upscaler's."""
+
+    __slots__ = ("height", "restarted", "stream", "width")
+    computed_share = 1.0
+
+    def __init__(self, height: int, width: int, stream: int, restarted: bool) -> None:
+        self.height, self.width = height, width
+        self.stream, self.restarted = stream, restarted
+
+
+class TieredUpscaler:
+    """Models by name, the best first, each made ready for the size of the stream; set `tier` to choose. A context manager.
+
+    With the step after that, the chosen model's memory begins anew: no memory is used by another network, nor one that missed frames.
+    All buffers are made by `prepare`, none by a switch. `display_height` chooses the scale, 2 or 3,
+    that comes nearest to it; without, it is 2.
+    It serves one stream at a time. Raises ModelError for what does not ship at the scale, and what `OnnxUpscaler` raises.
+    """
+
+    def __init__(self, names: Sequence[str], *, display_height: int | None, provider: str, threads: int | None) -> None:
+        self.names, self.provider = list(names), provider
+        self.tier = 0
+        self.costs_ns: list[int] = []
+        self.size: tuple[int, int] | None = None  # height and width that all is ready for
+        self._display_height, self._threads = display_height, threads
+        self._loaded: dict[int, list[OnnxUpscaler]] = {}
+        self._states: dict[int, State] = {}
+        self._running, self._stream = 0, 0
+        self._preparation: _Preparation | None = None
+        self._upscalers = self._load(2)  # what is missing or does not start is said at once
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    @property
+    def specs(self) -> list[ModelSpec]:
+        """Of the models in use, in the order of `names`."""
+        return [upscaler.spec for upscaler in self._upscalers]
+
+    @property
+    def threads(self) -> int:
+        return self._upscalers[0].threads
+
+    def scale(self, height: int) -> int:
+        """2 or 3, for pictures of this height."""
+        display_height = self._display_height or 2 * height
+        return min((2, 3), key=lambda scale: abs(scale * height - display_height))
+
+    def ready(self, height: int, width: int) -> bool:
+        """Whether pictures of this size can be upscaled, with the last tier at least; the first question about a size begins that.
+
+        It runs in a thread, from the last tier to the first, so that decoding goes on. Raises what it raised.
+        """
+        if self.size == (height, width) and (self._preparation is None or self._preparation.size == self.size):
+            return True
+        if self._preparation is None or self._preparation.size != (height, width):
+            self.close()  # one at a time: a stream cannot have more made by changing faster
+            self._preparation = _Preparation(self, height, width)
+            self._preparation.start()
+        preparation = self._preparation
+        if not preparation.usable.is_set():
+            preparation.check()
+            return False
+        self._upscalers, self._states, self.costs_ns = preparation.upscalers, preparation.states, preparation.costs_ns
+        self.size, self.tier = (height, width), len(self.names) - 1
+        return True
+
+    @property
+    def complete(self) -> bool:
+        """Whether every tier can be chosen, and has been timed; until then it is the last one. Raises as `ready` does."""
+        if self._preparation is not None and not self._preparation.is_alive():
+            self._preparation.check()
+            self._preparation = None
+        return self._preparation is None
+
+    def prepare(self, height: int, width: int) -> None:
+        """Wait until all is ready."""
+        while not self.ready(height, width) or not self.complete:
+            time.sleep(0.01)
+
+    def close(self) -> None:
+        """Wait for the thread, which ends with the tier that it is at."""
+        if self._preparation is not None:
+            self._preparation.stop = True
+            self._preparation.join()
+            self._preparation = None
+
+    def initial_state(self, height: int, width: int) -> TieredState:
+        """An empty memory; one that was given before is worth nothing any more."""
+        while not self.ready(height, width):
+            time.sleep(0.01)
+        self._stream += 1
+        self._begin_again()
+        return TieredState(height, width, self._stream, restarted=False)
+
+    def step(self, frame: Frame, state: TieredState) -> tuple[Frame, TieredState]:
+        """Upscale one frame with the chosen tier; raises ValueError for a state that is not this stream's."""
+        if state.stream != self._stream:
+            raise ValueError("this state is of a stream that was begun anew since")
+        if self.tier != self._running:
+            self._begin_again()
+        picture, after = self._upscalers[self._running].step(frame, self._states[self._running])
+        self._states[self._running] = after
+        return picture, TieredState(state.height, state.width, state.stream, after.restarted)
+
+    def _begin_again(self) -> None:
+        self._running = self.tier
+        self._states[self._running] = self._upscalers[self._running].begin_again(self._states[self._running])
+
+    def _load(self, scale: int) -> list[OnnxUpscaler]:
+        if scale not in self._loaded:
+            paths = [find_model(name, scale) for name in self.names]
+            upscalers = [OnnxUpscaler(path, provider=self.provider, threads=self._threads) for path in paths]
+            if len({upscaler.spec.scale for upscaler in upscalers}) > 1:
+                raise ModelError(f"{' and '.join(self.names)} are of different scales: tiers take each other's place")
+            self._loaded[scale] = upscalers
+        return self._loaded[scale]
+
+
+class _Preparation(threading.Thread):
+    """Makes each tier's buffers for a size, has it run and times it; the lists are filled as it goes."""
+
+    def __init__(self, tiers: TieredUpscaler, height: int, width: int) -> None:
+        super().__init__(name="tiers", daemon=True)
+        self.size = height, width
+        self.stop = False
+        self.usable = threading.Event()
+        self.upscalers: list[OnnxUpscaler] = []
+        self.states: dict[int, State] = {}
+        self.costs_ns = [0] * len(tiers.names)
+        self._error: GamesrError | None = None
+        self._tiers = tiers
+
+    def run(self) -> None:
+        try:
+            self.upscalers = self._tiers._load(self._tiers.scale(self.size[0]))
+            for tier in reversed(range(len(self.upscalers))):
+                if self.stop:
+                    break
+                self.states[tier], self.costs_ns[tier] = _timed(self.upscalers[tier], *self.size)
+                self.usable.set()
+        except GamesrError as error:
+            self._error = error
+
+    def check(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+
+def _timed(upscaler: OnnxUpscaler, height: int, width: int) -> tuple[State, int]:
+    """The buffers that frames of this size are computed in, and the least time that one took: others may be playing meanwhile."""
+    grey = [np.full(shape, 128, np.uint8) for shape in plane_shapes(height, width)]
+    frame, state = Frame(grey[0], grey[1], grey[2]), upscaler.initial_state(height, width)
+    durations_ns = []
+    for _ in range(2 + TIMED_FRAMES):  # both bindings have run before anything counts
+        begin_ns = time.perf_counter_ns()
+        _, state = upscaler.step(frame, state)
+        durations_ns.append(time.perf_counter_ns() - begin_ns)
+    return state, min(durations_ns[2:])

@@ -1,0 +1,155 @@
+"""The governor on a simulated machine: what it may never do, and what it always does in time."""
+
+from __future__ import annotations
+
+import itertools
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from client.deadline import MOST_LEFT_OUT, DeadlineRule
+from client.governor import HOLD_NS, MAX_HOLD_NS, MISSES_IN_A_ROW, Governor, Switch
+
+MS = 1_000_000
+PERIOD_NS = 16_666_667
+COSTS_NS = (9 * MS, 5 * MS, 2 * MS)  # the best first
+OTHER_NS = 2 * MS  # decoding and presenting
+SECOND = 60  # frames
+
+
+@dataclass
+class Machine:
+    """A player of 60 frames a second in simulated time: one frame at a time, the deadline rule before the upscaler."""
+
+    load: Callable[[int], float]  # of a frame's number: how many times slower than in warm-up everything is
+    costs_ns: tuple[int, ...] = COSTS_NS
+    jitter: float = 0.05
+    seed: int = 1
+    tiers: list[int] = field(default_factory=list)  # of each frame; -1 where it was left out
+    latencies_ns: list[int] = field(default_factory=list)
+    switches: list[Switch] = field(default_factory=list)
+
+    def run(self, frames: int) -> Machine:
+        governor = Governor(self.costs_ns, deadline_ns=PERIOD_NS, period_ns=PERIOD_NS, now_ns=0)
+        rule, draw = DeadlineRule(), random.Random(self.seed)
+        free_ns = 0
+        for number in range(frames):
+            arrival_ns = number * PERIOD_NS
+            slower = self.load(number) * (1 + self.jitter * draw.random())
+            decoded_ns = max(arrival_ns, free_ns) + int(OTHER_NS * slower)
+            waiting = min(frames - 1, decoded_ns // PERIOD_NS) - number
+            if rule.leaves_out(age_ns=decoded_ns - arrival_ns, waiting=waiting, frame_ns=governor.frame_ns, deadline_ns=PERIOD_NS):
+                free_ns = decoded_ns
+                self.tiers.append(-1)
+                switch = governor.left_out(decoded_ns, waiting=waiting)
+            else:
+                upscale_ns = int(self.costs_ns[governor.tier] * slower)
+                self.tiers.append(governor.tier)
+                free_ns = decoded_ns + upscale_ns
+                self.latencies_ns.append(free_ns - arrival_ns)
+                busy_ns = upscale_ns + int(OTHER_NS * slower)
+                switch = governor.shown(free_ns, latency_ns=free_ns - arrival_ns, busy_ns=busy_ns, upscale_ns=upscale_ns)
+            if switch is not None:
+                self.switches.append(switch)
+        return self
+
+    def kept(self) -> float:
+        return sum(latency_ns <= PERIOD_NS for latency_ns in self.latencies_ns) / len(self.tiers)
+
+
+def test_it_begins_with_the_best_that_fits() -> None:
+    def begun(*costs_ns: int) -> int:
+        return Governor(costs_ns, deadline_ns=PERIOD_NS, period_ns=PERIOD_NS, now_ns=0).tier
+
+    assert begun(9 * MS, 5 * MS, 2 * MS) == 0
+    assert begun(14 * MS, 5 * MS, 2 * MS) == 1
+    assert begun(60 * MS, 30 * MS, 20 * MS) == 2  # nothing fits: the cheapest
+    assert Governor((14 * MS, MS), deadline_ns=40 * MS, period_ns=PERIOD_NS, now_ns=0).tier == 1  # a late deadline makes no time
+
+
+def test_a_machine_that_keeps_up_is_left_alone() -> None:
+    machine = Machine(lambda _: 1.0).run(60 * SECOND)
+    assert machine.switches == [] and machine.kept() == 1.0
+
+
+def test_a_stolen_core_costs_few_deadlines_and_the_best_tier_comes_back() -> None:
+    """Twice as slow for 20 of 60 s: 99 of 100 deadlines are kept, and the end is as the beginning."""
+    machine = Machine(lambda number: 2.0 if 20 * SECOND <= number < 40 * SECOND else 1.0).run(60 * SECOND)
+    assert machine.kept() >= 0.99
+    assert machine.tiers[0] == machine.tiers[-1] == 0 and 0 not in machine.tiers[25 * SECOND : 39 * SECOND]
+    assert len(machine.switches) <= 4
+
+
+@settings(max_examples=40, deadline=None)
+@given(slow=st.floats(2.0, 12.0), begin=st.integers(0, 200), seed=st.integers(0, 9))
+def test_overload_is_answered_in_bounded_time(slow: float, begin: int, seed: int) -> None:
+    """However bad it gets, after three frames that missed (or were left out) it is a tier lower."""
+    machine = Machine(lambda number: slow if number >= begin else 1.0, seed=seed).run(begin + 60)
+    late = [number for number in range(begin, begin + 60) if machine.tiers[number] == 0]
+    assert len(late) <= MISSES_IN_A_ROW + 1
+    if slow > 8:  # even the cheapest is too slow: it is what runs
+        assert set(machine.tiers[begin + 3 * MISSES_IN_A_ROW + MOST_LEFT_OUT :]) <= {-1, 2}
+
+
+@settings(max_examples=25, deadline=None)
+@given(loads=st.lists(st.floats(0.5, 6.0), min_size=3, max_size=8), stays=st.integers(1, 300), seed=st.integers(0, 9))
+def test_it_never_hunts(loads: list[float], stays: int, seed: int) -> None:
+    """Whatever the load does: 2 s at least lie before every step up, and a tier that fails again and again is tried ever more rarely."""
+    machine = Machine(lambda number: loads[number // stays % len(loads)], seed=seed).run(40 * SECOND)
+    for before, after in itertools.pairwise(machine.switches):
+        if after.after < after.before:
+            assert after.at_ns - before.at_ns >= HOLD_NS
+        assert before.after == after.before != after.after
+    last_down: dict[int, int] = {}
+    for switch in machine.switches:
+        if switch.after > switch.before:
+            last_down[switch.before] = switch.at_ns
+        elif switch.after in last_down:
+            assert switch.at_ns - last_down[switch.after] >= HOLD_NS
+
+
+def test_a_tier_that_always_fails_is_tried_ever_more_rarely() -> None:
+    """A load that only the best tier brings: nothing foretells it, so only the back-off keeps it from coming every two seconds."""
+    governor = Governor(COSTS_NS, deadline_ns=PERIOD_NS, period_ns=PERIOD_NS, now_ns=0)
+    ups, switch = [], None
+    for number in range(600 * SECOND):
+        now_ns = number * PERIOD_NS
+        upscale_ns = 30 * MS if governor.tier == 0 else COSTS_NS[governor.tier]
+        switch = governor.shown(now_ns, latency_ns=upscale_ns + MS, busy_ns=upscale_ns + MS, upscale_ns=upscale_ns)
+        if switch is not None and switch.after == 0:
+            ups.append(switch.at_ns)
+    gaps = [b - a for a, b in itertools.pairwise(ups)]
+    assert 5 <= len(ups) <= 15
+    assert all(b >= min(1.9 * a, MAX_HOLD_NS) for a, b in itertools.pairwise(gaps))
+
+
+@settings(max_examples=25, deadline=None)
+@given(slow=st.floats(1.2, 8.0), lasts=st.integers(5, 20 * SECOND), seed=st.integers(0, 9))
+def test_it_climbs_back_when_the_load_goes(slow: float, lasts: int, seed: int) -> None:
+    machine = Machine(lambda number: slow if number < lasts else 1.0, seed=seed).run(lasts + (MAX_HOLD_NS // PERIOD_NS) + 10 * SECOND)
+    assert machine.tiers[-1] == 0
+
+
+@settings(max_examples=20, deadline=None)
+@given(slow=st.floats(0.5, 20.0), jitter=st.floats(0, 1.0), seed=st.integers(0, 99))
+def test_latency_never_grows(slow: float, jitter: float, seed: int) -> None:
+    """Even where decoding is all that the machine can do: what it owes to shown frames it makes good before the next one is shown."""
+    slow = min(slow, 0.95 * PERIOD_NS / OTHER_NS / (1 + jitter))
+    machine = Machine(lambda _: slow, jitter=jitter, seed=seed).run(30 * SECOND)
+    frame_ns = slow * (1 + jitter) * (COSTS_NS[2] + OTHER_NS)
+    assert max(machine.latencies_ns[len(machine.latencies_ns) // 2 :]) <= (MOST_LEFT_OUT + 2) * (frame_ns + PERIOD_NS)
+
+
+def test_a_tier_is_not_tried_that_the_measured_load_forbids() -> None:
+    """Half as fast as in warm-up: the middle tier fits, the best would come to 18 ms, and is never tried."""
+    machine = Machine(lambda _: 2.0, costs_ns=(9 * MS, 4 * MS, 2 * MS)).run(60 * SECOND)
+    assert machine.tiers[5 * SECOND :].count(0) == 0 and set(machine.tiers[10 * SECOND :]) == {1}
+
+
+def test_every_switch_has_its_reason() -> None:
+    machine = Machine(lambda number: 10.0 if number > 30 else 1.0).run(60)
+    assert machine.switches and all("frame" in switch.reason and switch.before != switch.after for switch in machine.switches)
+    assert Machine(lambda _: 10.0, costs_ns=COSTS_NS[:1]).run(60).switches == []

@@ -1,0 +1,356 @@
+"""gamesr-play as a command: whatever it is given, one clear sentence or a picture; how it ends, what it writes and posts."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from fractions import Fraction
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from client import play_cli
+from client.errors import InputError, OutputError
+from client.frames import ColourTags, Frame
+from client.play_post import PATH, post_summary
+from client.play_sink import Resizer, Y4mSink
+from client.play_source import open_source, shown_url
+from client.upscaler import OnnxUpscaler
+from client.video import from_av_frame, read_frames
+from server.requests import ClientLatencyRequest
+from tests.conftest import FRAMES, HEIGHT, WIDTH
+from tests.moving import picture
+from tests.streaming import planes
+
+MakeClip = Callable[..., Path]
+Play = Callable[..., tuple[int, str, str]]
+LONG_S = 60.0
+
+
+@pytest.fixture
+def play(model_file: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> Play:
+    """Runs the command with a tiny model, its deadline far away, into nothing unless told otherwise."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        given = list(map(str, arguments))
+        defaults = {"--sink": "null", "--deadline-ms": "100000"} | ({} if "--tiers" in given else {"--model": str(model_file())})
+        for option, value in defaults.items():
+            given += [] if option in given else [option, value]
+        status = play_cli.main([*given, "--threads", "1"])
+        said = capsys.readouterr()
+        return status, said.out, said.err
+
+    return run
+
+
+def y4m_frames(path: Path) -> list[Frame]:
+    with av.open(str(path)) as container:
+        return [from_av_frame(frame) for frame in container.decode(video=0)]
+
+
+def test_a_file_into_y4m(play: Play, make_clip: MakeClip, model_file: Callable[..., Path], tmp_path: Path) -> None:
+    clip, out = make_clip(), tmp_path / "out.y4m"
+    status, said, errors = play(clip, "--sink", out, "--json")
+    record = json.loads(said)
+    assert status == 0 and "Traceback" not in errors
+    assert record["frames"] == {"shown": FRAMES, "late": 0, "left_out": 0, "unready": 0, "damaged": 0}
+    assert record["sizes"] == [[WIDTH, HEIGHT]] and record["reception"] is None and record["deadlines_kept"] == 1.0
+    upscaler = OnnxUpscaler(model_file())
+    state = upscaler.initial_state(HEIGHT, WIDTH)
+    for frame, kept in zip(read_frames(clip), y4m_frames(out), strict=True):
+        want, state = upscaler.step(frame, state)
+        assert planes(want) == planes(kept)
+    with av.open(str(out)) as container:
+        assert container.streams.video[0].average_rate == 30
+    assert not list(tmp_path.glob(".*.part"))
+    status, _, errors = play(clip, "--sink", out)
+    assert status == 1 and "--force" in errors
+    assert play(clip, "--sink", out, "--force", "--frames", 3)[0] == 0 and len(y4m_frames(out)) == 3
+
+
+def test_a_display_that_is_neither_twice_nor_three_times_as_large(play: Play, make_clip: MakeClip, tmp_path: Path) -> None:
+    out = tmp_path / "out.y4m"
+    assert play(make_clip(), "--sink", out, "--display", "160x120", "--frames", 2)[0] == 0
+    assert {(frame.width, frame.height) for frame in y4m_frames(out)} == {(160, 120)}
+
+
+@pytest.mark.parametrize(
+    "tags", [ColourTags(1, 1, 1, 1), ColourTags(2, 1, 1, 1), ColourTags(0, 2, 2, 2)], ids=["limited", "full", "unsaid"]
+)
+def test_resizing_changes_no_colour(tags: ColourTags) -> None:
+    """A flat picture of any code value stays that, whatever its tags say; a ramp stays within a code value of itself."""
+    resizer = Resizer(72, 48)
+    for value in (0, 16, 100, 235, 255):
+        flat = Frame(
+            *(np.full(shape, value, np.uint8) for shape in ((32, 48), (16, 24), (16, 24))), colour=tags, pts=7, time_base=Fraction(1, 9)
+        )
+        resized = resizer.resize(flat)
+        assert all((plane == value).all() for plane in (resized.y, resized.u, resized.v))
+        assert (resized.width, resized.height, resized.colour, resized.pts, resized.time_base) == (72, 48, tags, 7, flat.time_base)
+    ramp = np.tile((40 + 2 * np.arange(48)).astype(np.uint8), (32, 1))
+    resized = resizer.resize(Frame(ramp, ramp[:16, :24].copy(), ramp[:16, :24].copy(), colour=tags))
+    want = 40 + 2 * ((np.arange(72) + 0.5) / 1.5 - 0.5)
+    assert np.abs(resized.y[:, 4:-4] - want[4:-4]).max() <= 1
+    same = picture(0, 48, 72)
+    assert resizer.resize(same) is same
+
+
+def test_y4m_is_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "out.y4m"
+    with pytest.raises(ZeroDivisionError), Y4mSink(path) as sink:
+        sink.write(picture(0))
+        raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == []
+    with Y4mSink(path):
+        pass  # nothing was shown: no file
+    assert list(tmp_path.iterdir()) == []
+    with Y4mSink(path) as sink:
+        sink.write(picture(0, 32, 48))
+        sink.write(picture(1, 64, 96))  # of another size
+        sink.period_ns = 1_000_000_000 * 1001 // 60000
+    with av.open(str(path)) as container:
+        assert container.streams.video[0].average_rate == Fraction(60000, 1001)
+    assert [(frame.width, frame.height) for frame in y4m_frames(path)] == [(48, 32)] * 2
+    for full, said in ((2, 2), (1, 1)):
+        with Y4mSink(path, force=True) as sink:
+            sink.write(Frame(*(np.full(s, 200, np.uint8) for s in ((4, 6), (2, 3), (2, 3))), colour=ColourTags(range=full)))
+        assert y4m_frames(path)[0].colour.range == said
+    with pytest.raises(OutputError, match="does not exist"):
+        Y4mSink(tmp_path / "no" / "out.y4m")
+
+
+@pytest.mark.parametrize(
+    ("source", "sentence"),
+    [
+        ("none.mp4", "does not exist"),
+        ("127.0.0.1:0", "no address to listen on"),
+        (":99999", "no address to listen on"),
+        ("rtp://127.0.0.1", "no address to listen on"),
+        ("rtp://127.0.0.1:5004/path", "no address to listen on"),
+        ("999.1.1.1:5004", "no address to listen on"),
+        ("file:///etc/passwd", "file:// is not played"),
+        ("concat:/etc/passwd|/etc/hosts", "does not exist"),
+        ("pipe://0", "pipe:// is not played"),
+        ("subfile,,start,0,end,9,,:/etc/passwd", "does not exist"),
+        ("crypto+http://127.0.0.1/x", "is not played"),
+        ("http://[", "is no URL"),
+        ("http://127.0.0.1:1/x.mp4", "cannot be opened: Connection refused"),
+        ("rtsp://me:secret@127.0.0.1:1/x", "rtsp://127.0.0.1:1/x cannot be opened"),
+        ("none.sdp", "cannot be read"),
+        ("", "is not a file"),
+    ],
+)
+def test_sources_that_are_none(play: Play, source: str, sentence: str) -> None:
+    status, out, errors = play(source)
+    assert status == 1 and out == "" and "secret" not in errors
+    assert errors.startswith("gamesr-play: ") and sentence in errors and len(errors.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "sentence"),
+    [
+        ("x.sdp", b"", "SDP"),
+        ("x.sdp", b"\0" * 1000, "SDP"),
+        ("x.sdp", b"v=0\r\nm=video 0 RTP/AVP 96\r\na=rtpmap:96 H264/90000\r\n", "no port"),
+        ("x.sdp", b"v=0\r\nm=audio 5004 RTP/AVP 96\r\n", "no H.264 video"),
+        ("x.sdp", b"v=0\r\n" * 20000, "larger than 64 KiB"),
+        ("x.txt", b"not a video\n" * 100, "is not a video file"),
+        ("x.mp4", b"", "is empty"),
+        ("x.m3u8", b"#EXTM3U\n#EXTINF:1,\nfile:///etc/passwd\n", "is not a video file"),
+        ("x.ffconcat", b"ffconcat version 1.0\nfile /etc/passwd\n", "is not a video file"),
+    ],
+)
+def test_files_that_are_none(play: Play, tmp_path: Path, name: str, content: bytes, sentence: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    status, out, errors = play(path)
+    assert status == 1 and out == "" and sentence in errors and len(errors.splitlines()) == 1
+
+
+def test_a_playlist_behind_a_url_names_no_file(make_clip: MakeClip, tmp_path: Path) -> None:
+    """Served over HTTP: what it names is not opened; a video is."""
+    clip = make_clip()
+    (tmp_path / "list.m3u8").write_text(f"#EXTM3U\n#EXTINF:1,\nfile://{clip}\n#EXT-X-ENDLIST\n")
+
+    class Serve(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            content = (tmp_path / self.path.strip("/")).read_bytes()
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with serving(Serve) as address:
+        with (
+            open_source(f"{address}/list.m3u8", until_bye=True, tell=lambda *_: None) as source,
+            pytest.raises(InputError, match="cannot be"),
+        ):
+            list(source.frames(lambda: None))
+        with open_source(f"{address}/{clip.name}", until_bye=False, tell=lambda *_: None) as source:
+            frames = [item.frame for item in source.frames(lambda: None)]
+    assert [planes(frame) for frame in frames] == [planes(frame) for frame in read_frames(clip)] and source.reception is None
+
+
+@contextmanager
+def serving(handler: type[BaseHTTPRequestHandler]) -> Iterator[str]:
+    with HTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--sink", "out.mp4"],
+        ["--display", "1920"],
+        ["--display", "1921x1080"],
+        ["--display", "99999x2"],
+        ["--tiers", "gamesr,,live"],
+        ["--tiers", "gamesr,gamesr"],
+        ["--tiers", "gamesr", "--model", "gamesr"],
+        ["--deadline-ms", "nan"],
+        ["--deadline-ms", "-1"],
+        ["--seconds", "inf"],
+        ["--frames", "0"],
+        ["--provider", "tpu"],
+        ["--fullscreen", "--sink", "null"],
+    ],
+)
+def test_wrong_usage(arguments: list[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        play_cli.main(["127.0.0.1:5004", *arguments])
+
+
+def test_tiers_that_do_not_ship_are_an_error(play: Play, make_clip: MakeClip) -> None:
+    status, _, errors = play(make_clip(), "--tiers", "bicubic,warp")
+    assert status == 1 and "no model named 'warp' ships for scale 2" in errors and len(errors.splitlines()) == 1
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_with_the_summary(make_clip: MakeClip, model_file: Callable[..., Path], tmp_path: Path, signum: int) -> None:
+    """Also the file is whole: all that was shown is in it."""
+    out = tmp_path / "out.y4m"
+    arguments = [str(make_clip(frames=900)), "--model", str(model_file()), "--sink", str(out), "--json", "--threads", "1"]
+    program = [sys.executable, "-c", "import sys; from client.play_cli import main; sys.exit(main())", *arguments]
+    environment = os.environ | {"PYTHONPATH": str(Path.cwd())}
+    with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as process:
+        try:
+            assert process.stderr is not None and "with" in process.stderr.readline()  # it has begun
+            while not (parts := list(tmp_path.glob(".*.part"))) or parts[0].stat().st_size < 50_000:
+                assert process.poll() is None
+            process.send_signal(signum)
+            said, errors = process.communicate(timeout=LONG_S)
+        finally:
+            process.kill()
+    assert process.returncode == 128 + signum and "Traceback" not in errors
+    record = json.loads(said)
+    assert record["ended"] in ("interrupted", "told to end") and len(y4m_frames(out)) == record["frames"]["shown"] > 0
+
+
+class Collects(BaseHTTPRequestHandler):
+    """A service that takes summaries at PATH, redirects from /moved and refuses elsewhere."""
+
+    taken: list[tuple[str, dict[str, str], bytes]]
+
+    def do_POST(self) -> None:
+        body = self.rfile.read(int(self.headers["Content-Length"]))
+        type(self).taken.append((self.path, dict(self.headers), body))
+        status = {PATH: 201, f"/moved{PATH}": 307}.get(self.path, 422)
+        answer = b"{}" if status == 201 else json.dumps({"detail": "no such\nthing"}).encode()
+        self.send_response(status)
+        self.send_header("Content-Length", str(len(answer)))
+        self.send_header("Location", PATH)
+        self.end_headers()
+        self.wfile.write(answer)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def test_a_summary_is_posted_as_the_service_takes_it(play: Play, make_clip: MakeClip, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GAMESR_API_KEY", "a key of many letters")
+    Collects.taken = []
+    with serving(Collects) as address:
+        status, out, errors = play(make_clip(), "--post", address)
+        assert status == 0, errors
+        ((path, headers, body),) = Collects.taken
+        assert path == PATH and headers["X-Api-Key"] == "a key of many letters"
+        posted = ClientLatencyRequest.model_validate_json(body)
+        assert posted.latency_us.total.count == FRAMES and posted.model == "tiny" and (posted.low_width, posted.scale) == (WIDTH, 2)
+        # A refusal loses nothing: the summary was said before. No other address gets the key.
+        for where, sentence in (("/elsewhere", "422 no suchthing"), ("/moved", "307")):
+            status, out, errors = play(make_clip(), "--post", address + where, "--json")
+            assert status == 1 and json.loads(out)["frames"]["shown"] == FRAMES and sentence in errors.splitlines()[-1]
+        assert len(Collects.taken) == 3
+    for url in (address, "ftp://127.0.0.1/", "http://", "nonsense", "http://127.0.0.1:99999", "http://a b/", "http://[::1"):
+        with pytest.raises(OutputError):
+            post_summary(url, {})
+
+
+def test_a_window_is_a_sink_like_another(play: Play, make_clip: MakeClip, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keys: the overlay, the wipe with bicubic, and the end."""
+    pytest.importorskip("sdl2")
+    from client import window
+    from client.window import Action, Window
+
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    pressed = [[], [Action.OVERLAY], [], [Action.WIPE], [], [], [Action.WIPE], [], [Action.QUIT]]
+    seen: list[tuple[tuple[int, int], bool, int]] = []
+
+    def present(self: Window, shown: Frame, *, left: Frame | None = None, overlay: Sequence[str] = ()) -> None:
+        assert left is None or left.y.shape == shown.y.shape
+        seen.append((shown.y.shape, left is not None, len(overlay)))
+
+    monkeypatch.setattr(window.Window, "present", present)
+    monkeypatch.setattr(window.Window, "actions", lambda self: pressed.pop(0) if pressed and len(seen) > 9 - len(pressed) else [])
+    status, out, errors = play(make_clip(frames=40), "--sink", "window", "--json")
+    assert status == 0, errors
+    assert json.loads(out)["ended"] == "the window was closed"
+    assert {size for size, _, _ in seen} == {(2 * HEIGHT, 2 * WIDTH)}
+    assert {wiped for _, wiped, _ in seen} == {False, True} and not seen[-1][1] and seen[0][2] == 0 and seen[-1][2] >= 6
+
+
+def test_urls_are_shown_without_secrets() -> None:
+    assert shown_url("rtsp://me:secret@example.org:8554/game?token=x#y") == "rtsp://example.org:8554/game"
+
+
+def test_the_lines_of_the_docs_are_ours() -> None:
+    text = (Path(__file__).parent.parent / "docs/play.md").read_text()
+    lines = [line.split("#")[0].split() for line in text.splitlines() if line.startswith("    gamesr-play ")]
+    assert len(lines) >= 4
+    for _, *arguments in lines:
+        play_cli.parser().parse_args(arguments)
+
+
+def test_what_goes_on_happening_is_said_ever_more_rarely(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 1000.0
+    monkeypatch.setattr("client.play_cli.time.monotonic", lambda: now)
+    say = play_cli.Say()
+    for _ in range(6000):
+        say("overflow", "again")
+        now += 0.1
+    say("size", "another")
+    lines = capsys.readouterr().err.splitlines()
+    assert 8 <= lines.count("gamesr-play: again") <= 18 and lines[-1] == "gamesr-play: another" and say.counts["overflow"] == 6000
+    now += 600
+    for _ in range(2):
+        say("overflow", "again")
+        now += 1.1
+    assert len(capsys.readouterr().err.splitlines()) == 2

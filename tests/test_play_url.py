@@ -1,0 +1,120 @@
+"""What FFmpeg opens, when it falls silent, breaks off, or comes faster than it is taken."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+from client import play_url
+from client.errors import InputError
+from client.play_source import Arrived, open_source
+from client.video import VideoSource, read_frames
+from tests.streaming import planes
+from tests.test_player import Told
+
+MakeClip = Callable[..., Path]
+LONG_S = 60.0
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(play_url, "_READ_S", 0.5)
+    monkeypatch.setattr(play_url, "_RETRY_S", 0.05)
+
+
+@contextmanager
+def server(content: bytes, *, silent: int, most: int = 99) -> Iterator[str]:
+    """Sends its content to whoever connects; the first `silent` connections then stay open without a word, `most` are taken."""
+    done = threading.Event()
+
+    def run(listener: socket.socket) -> None:
+        open_ones = []
+        for number in range(most):
+            with suppress(OSError):
+                connection, _ = listener.accept()
+                with suppress(OSError):
+                    connection.sendall(content)
+                if number < silent:
+                    open_ones.append(connection)
+                else:
+                    connection.close()
+            if done.is_set():
+                break
+        for connection in open_ones:
+            connection.close()
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        address = listener.getsockname()
+        thread = threading.Thread(target=run, args=(listener,), daemon=True)
+        thread.start()
+        yield f"tcp://127.0.0.1:{address[1]}"
+        done.set()
+        with suppress(OSError), socket.create_connection(address, 1):
+            pass
+        thread.join(LONG_S)
+
+
+def waiting_at_most() -> Callable[[], None]:
+    end = time.monotonic() + LONG_S
+
+    def idle() -> None:
+        assert time.monotonic() < end
+
+    return idle
+
+
+def test_silence_is_given_up_and_it_is_opened_again(make_clip: MakeClip) -> None:
+    clip, told, items = make_clip("clip.ts"), Told(), list[Arrived]()
+    want = [planes(frame) for frame in read_frames(clip)]
+    with server(clip.read_bytes(), silent=1) as url, open_source(url, until_bye=False, tell=told) as source:
+        for item in source.frames(waiting_at_most()):
+            items.append(item)
+            if len(items) == 2 * len(want):
+                break
+    assert [planes(item.frame) for item in items] == 2 * want and told.kinds() == ["goodbye"]
+    assert all(item.last_ns <= item.packet_ns and item.sent_ns is None for item in items) and source.reception is None
+
+
+def test_the_end_is_the_end_when_told_so(make_clip: MakeClip) -> None:
+    clip = make_clip("clip.ts")
+    with server(clip.read_bytes(), silent=0) as url, open_source(url, until_bye=True, tell=Told()) as source:
+        assert len(list(source.frames(waiting_at_most()))) == len(list(read_frames(clip)))
+
+
+@pytest.mark.parametrize("content", [b"", b"not a video\n" * 1000, b"\x47" * 5000], ids=["nothing", "text", "sync-bytes"])
+def test_what_is_no_video_is_refused(content: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(play_url, "_OPEN_S", 1.0)
+    refused = pytest.raises(InputError, match=r"^tcp://127\.0\.0\.1:\d+ ")
+    with server(content, silent=0) as url, open_source(url, until_bye=False, tell=Told()) as source, refused:
+        list(source.frames(waiting_at_most()))
+
+
+def test_silence_from_the_beginning_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(play_url, "_OPEN_S", 0.3)
+    refused = pytest.raises(InputError, match="nothing came")
+    with server(b"", silent=1) as url, open_source(url, until_bye=False, tell=Told()) as source, refused:
+        list(source.frames(waiting_at_most()))
+
+
+def test_who_takes_too_slowly_loses_and_knows_it(make_clip: MakeClip, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Memory is bounded, and what follows is damaged until a key frame."""
+    monkeypatch.setattr(play_url, "_PACKETS_QUEUED", 8)
+    told = Told()
+    reader = play_url._Reader("", "")
+    with VideoSource(make_clip(frames=40, options={"g": "60", "bf": "0"})) as reader._video:
+        packets = list(reader._video.packets())
+        reader._put(packets[0])
+        frames = reader.frames(waiting_at_most(), told)
+        assert not next(frames).frame.damaged
+        for packet in packets[1:-1]:
+            reader._put(packet)
+            assert len(reader.packets) <= 8
+        reader._ended = True
+        rest = list(frames)
+    assert told.kinds() == ["overflow"] and 0 < len(rest) <= 8 and all(item.frame.damaged for item in rest)
