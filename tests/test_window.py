@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import sys
+import time
 import weakref
 from collections.abc import Iterator
 from ctypes import byref, c_int
@@ -17,6 +18,7 @@ from client.errors import OutputError
 from client.frames import ColourTags, Frame, Plane
 from client.textures import load_sdl
 from client.window import Action, Window
+from tests.headless import headless_screen
 
 sdl2 = load_sdl()
 
@@ -318,12 +320,38 @@ def test_sdl_is_shut_down_whatever_happens() -> None:
     assert not sdl2.SDL_WasInit(sdl2.SDL_INIT_VIDEO)
 
 
-def test_no_display_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SDL_VIDEODRIVER", "x11")
+@pytest.mark.parametrize("driver", ["x11", None], ids=["asked for", "any"])
+def test_no_display_is_one_sentence(monkeypatch: pytest.MonkeyPatch, driver: str | None) -> None:
+    """Where SDL may choose, it falls back to drawing where nobody sees it, without a word."""
     monkeypatch.setenv("DISPLAY", ":4711")
-    with pytest.raises(OutputError, match=r"^no window can be opened, as SDL finds no display \(.+\): set DISPLAY .*libsdl2-2\.0-0[^\n]*$"):
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.delenv("SDL_VIDEODRIVER")
+    if driver:
+        monkeypatch.setenv("SDL_VIDEODRIVER", driver)
+    with pytest.raises(OutputError, match=r"^no window can be opened, as SDL finds no display.*: set DISPLAY .*libsdl2-2\.0-0[^\n]*$"):
         Window("test")
     assert not sdl2.SDL_WasInit(0)
+
+
+@pytest.mark.parametrize("renderer", ["software", "opengl", None], ids=["software", "OpenGL", "any"])
+def test_a_real_window_shows_the_same(monkeypatch: pytest.MonkeyPatch, renderer: str | None) -> None:
+    """As the X server has it, through SDL's renderers."""
+    ours, theirs = (noise(320, 180, seed) for seed in (1, 2))
+    with headless_screen(320, 180) as screen:
+        monkeypatch.setenv("SDL_VIDEODRIVER", "x11")
+        monkeypatch.setenv("DISPLAY", screen.display)
+        if renderer:
+            monkeypatch.setenv("SDL_RENDER_DRIVER", renderer)
+        with Window("test") as window:
+            window.present(theirs)
+            window.present(ours, left=theirs)
+            time.sleep(0.2)  # an OpenGL picture may come after present has returned
+            shown = screen.picture().astype(int)
+    # OpenGL raises chroma linearly: luma's noise is told from the other picture's all the same.
+    for side, frame in ((slice(0, 158), theirs), (slice(162, 320), ours)):
+        distance = np.abs(shown - expected(frame))[:, side]
+        assert distance.mean() < 25 if renderer == "opengl" else distance.max() <= 2.5
+    assert (shown[:, 160] == 255).all()
 
 
 def test_no_library_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
