@@ -8,6 +8,7 @@ import time
 import weakref
 from collections.abc import Iterator
 from ctypes import byref, c_int
+from pathlib import Path
 
 import numpy as np
 import psutil
@@ -191,6 +192,8 @@ def test_the_wipe_has_one_picture_on_each_side(window: Window, width: int, heigh
         np.testing.assert_array_equal(both[:, split + 1 + blurred :], alone[:, split + 1 + blurred :])
         lines = (both == 255).all(axis=2)[:, start:stop].all(axis=0)
         assert np.flatnonzero(lines).tolist() == [split - start]
+    window.wipe_share = -0.5  # what is outside counts as the edge
+    np.testing.assert_array_equal(shown(ours, theirs), alone)
     window.wipe_share = 0.0
     np.testing.assert_array_equal(shown(ours, theirs), alone)
     window.wipe_share = 1.0
@@ -318,6 +321,18 @@ def test_sdl_is_shut_down_whatever_happens() -> None:
         window.present(noise())
         raise ZeroDivisionError
     assert not sdl2.SDL_WasInit(sdl2.SDL_INIT_VIDEO)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="what handles a signal is asked of Linux")
+def test_signals_stay_the_programs() -> None:
+    """SDL would make an event of SIGTERM, which nobody may be polling."""
+
+    def caught() -> list[str]:
+        return [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("SigCgt")]
+
+    before = caught()
+    with Window("test"):
+        assert caught() == before
 
 
 @pytest.mark.parametrize("driver", ["x11", None], ids=["asked for", "any"])
