@@ -57,7 +57,6 @@ class PictureTexture:
     def _update(self, frame: Frame, start: int, stop: int) -> None:
         planes: list[Any] = []
         for plane, column in ((frame.y, start), (frame.u, start // 2), (frame.v, start // 2)):
-            # By address: a pointer made by ctypes' cast refers to itself, and would hold the plane until the garbage is collected.
             planes += byref(c_uint8.from_address(plane.ctypes.data + column)), plane.strides[0]
         area = self._sdl.SDL_Rect(start, 0, stop - start, frame.height)
         if self._sdl.SDL_UpdateYUVTexture(self.texture, area, *planes):

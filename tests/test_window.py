@@ -296,7 +296,7 @@ def test_300_frames_leave_nothing_behind(window: Window) -> None:
     def play(frames: int) -> int:
         for index in range(frames):
             picture = pictures[index % 2]
-            window.present(picture, left=picture, overlay=[f"frame {index}"])
+            window.present(picture, left=picture, overlay=["x" * (1 + index % 50)] * 15)
             window.actions()
         return int(psutil.Process().memory_info().rss)
 
@@ -362,6 +362,11 @@ def test_a_real_window_shows_the_same(monkeypatch: pytest.MonkeyPatch, renderer:
             window.present(ours, left=theirs)
             time.sleep(0.2)  # an OpenGL picture may come after present has returned
             shown = screen.picture().astype(int)
+            for tags in (BT601, BT709, BT601_FULL):
+                frame = Frame(np.full((180, 320), 120, np.uint8), *(np.full((90, 160), code, np.uint8) for code in (90, 170)), colour=tags)
+                window.present(frame)
+                time.sleep(0.2)
+                assert np.abs(screen.picture() - expected(frame)).max() <= 2.5
     # OpenGL raises chroma linearly: luma's noise is told from the other picture's all the same.
     for side, frame in ((slice(0, 158), theirs), (slice(162, 320), ours)):
         distance = np.abs(shown - expected(frame))[:, side]
