@@ -57,7 +57,6 @@ class PictureTexture:
     def _update(self, frame: Frame, start: int, stop: int) -> None:
         planes: list[Any] = []
         for plane, column in ((frame.y, start), (frame.u, start // 2), (frame.v, start // 2)):
-            # By address: a pointer made by ctypes' cast refers to itself, and would hold the plane until the garbage is collected.
             planes += byref(c_uint8.from_address(plane.ctypes.data + column)), plane.strides[0]
         area = self._sdl.SDL_Rect(start, 0, stop - start, frame.height)
         if self._sdl.SDL_UpdateYUVTexture(self.texture, area, *planes):
@@ -112,7 +111,7 @@ def _conversion(sdl: Any, colour: ColourTags) -> int:
     """SDL's way from planes to colours that is nearest to the tags (SDL_YUV_CONVERSION_MODE, SDL_surface.h).
 
     SDL 2 knows BT.601 and BT.709 in limited range and BT.601 in full range ("JPEG"). BT.709 in full range gets the latter:
-    greys are right and saturated colours are not, where the other choice would also have been wrong in black and white.
+    greys are right and a saturated green is 36 codes of 255 off, where BT.709's limited range would be 19 off in black and white.
     Everything else is taken for BT.709, as by `client.rgb`.
     """
     if colour.range == 2:

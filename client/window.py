@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from ctypes import byref, c_int
+from ctypes import CFUNCTYPE, byref, c_char_p, c_int, c_uint
 from enum import Enum
 from types import TracebackType
 from typing import Any, Self
@@ -13,6 +13,7 @@ from client.frames import Frame
 from client.textures import PictureTexture, TextTexture, load_sdl, sdl_error
 
 ARROW_STEP = 0.02  # of the picture's width
+GL_RENDERER = 0x1F01  # glGetString's name for what draws
 
 
 class Action(Enum):
@@ -27,9 +28,9 @@ class Action(Enum):
 class Window:
     """One window, which shows itself with the first picture, as large as that or as the screen allows; a context manager.
 
-    All calls come from the thread that made it, and there is one at a time. Where SDL finds graphics hardware (or OpenGL in
-    software, if there is none) that makes the colours and scales, else SDL's own software; `SDL_RENDER_DRIVER=software`
-    asks for that one. `wipe_share` says how much of the picture, 0 to 1 from the left, shows the other one.
+    All calls come from the thread that made it, and there is one at a time. Graphics hardware makes the colours and scales
+    where there is any, else SDL's software; `SDL_RENDER_DRIVER` in the environment overrules that. `wipe_share` says how much
+    of the picture, 0 to 1 from the left, shows the other one.
 
     Raises OutputError, in one sentence that says what to install, where there is no SDL or no display.
     """
@@ -50,6 +51,7 @@ class Window:
             sdl.SDLK_w: Action.WIPE,
         }
         sdl.SDL_SetHint(sdl.SDL_HINT_RENDER_SCALE_QUALITY, b"linear")
+        sdl.SDL_SetHint(sdl.SDL_HINT_FRAMEBUFFER_ACCELERATION, b"0")  # else SDL's software shows its picture through OpenGL again
         sdl.SDL_SetHint(sdl.SDL_HINT_NO_SIGNAL_HANDLERS, b"1")  # SIGINT and SIGTERM are the program's
         try:
             self._open(title)
@@ -108,24 +110,43 @@ class Window:
 
     def _open(self, title: str) -> None:
         sdl = self._sdl
-        if sdl.SDL_Init(sdl.SDL_INIT_VIDEO):
+        failed = sdl.SDL_Init(sdl.SDL_INIT_VIDEO)
+        # Without a display SDL takes a driver that draws where nobody sees it; who wants that asks for it.
+        if failed or (sdl.SDL_GetCurrentVideoDriver() == b"offscreen" and not sdl.SDL_GetHint(b"SDL_VIDEODRIVER")):
+            reason = f" ({sdl_error(sdl)})" if failed else ""
             hint = "set DISPLAY or WAYLAND_DISPLAY, and install libsdl2-2.0-0, which brings the system's libraries for them"
-            raise OutputError(f"no window can be opened, as SDL finds no display ({sdl_error(sdl)}): {hint}")
-        flags = sdl.SDL_WINDOW_HIDDEN | sdl.SDL_WINDOW_RESIZABLE
-        anywhere = sdl.SDL_WINDOWPOS_UNDEFINED
-        self._window = sdl.SDL_CreateWindow(title.encode(), anywhere, anywhere, 640, 360, flags)
-        # Flags of 0: hardware comes first in SDL's list of renderers, software last. And no SDL_RENDERER_PRESENTVSYNC: who
-        # waits for a blank measures the screen, and misses deadlines that the picture has met; it may tear instead.
-        self._renderer = self._window and sdl.SDL_CreateRenderer(self._window, -1, 0)
+            raise OutputError(f"no window can be opened, as SDL finds no display{reason}: {hint}")
+        # Hardware comes first in SDL's list of renderers, software last. And no SDL_RENDERER_PRESENTVSYNC: who waits for a
+        # blank measures the screen, and misses deadlines that the picture has met; it may tear instead.
+        self._create(title, 0)
+        if self._is_opengl_on_the_processor():
+            self._destroy()
+            self._create(title, sdl.SDL_RENDERER_SOFTWARE)
+
+    def _create(self, title: str, flags: int) -> None:
+        sdl = self._sdl
+        anywhere, kind = sdl.SDL_WINDOWPOS_UNDEFINED, sdl.SDL_WINDOW_HIDDEN | sdl.SDL_WINDOW_RESIZABLE
+        self._window = sdl.SDL_CreateWindow(title.encode(), anywhere, anywhere, 640, 360, kind)
+        self._renderer = self._window and sdl.SDL_CreateRenderer(self._window, -1, flags)
         if not self._renderer:
             raise OutputError(f"no window can be opened: {sdl_error(sdl)}")
 
+    def _is_opengl_on_the_processor(self) -> bool:
+        """Mesa's stand-in for hardware, which takes all cores and many times as long as SDL's software does."""
+        if not self._sdl.SDL_GL_GetCurrentContext():
+            return False
+        get_string = CFUNCTYPE(c_char_p, c_uint)(self._sdl.SDL_GL_GetProcAddress(b"glGetString"))
+        return any(name in (get_string(GL_RENDERER) or b"") for name in (b"llvmpipe", b"softpipe"))
+
     def _close(self) -> None:
-        """Also what is half open, and again; the renderer takes its textures with it."""
-        self._sdl.SDL_DestroyRenderer(self._renderer)
+        """Also what is half open, and again."""
+        self._destroy()
+        self._sdl.SDL_Quit()
+
+    def _destroy(self) -> None:
+        self._sdl.SDL_DestroyRenderer(self._renderer)  # and its textures
         self._sdl.SDL_DestroyWindow(self._window)
         self._window = self._renderer = None
-        self._sdl.SDL_Quit()
 
     def _show(self, picture: Frame) -> None:
         sdl, bounds = self._sdl, self._sdl.SDL_Rect()

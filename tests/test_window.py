@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import gc
+import re
+import signal
 import sys
+import time
 import weakref
 from collections.abc import Iterator
 from ctypes import byref, c_int
+from pathlib import Path
 
 import numpy as np
 import psutil
@@ -17,6 +21,7 @@ from client.errors import OutputError
 from client.frames import ColourTags, Frame, Plane
 from client.textures import load_sdl
 from client.window import Action, Window
+from tests.headless import headless_screen
 
 sdl2 = load_sdl()
 
@@ -189,6 +194,8 @@ def test_the_wipe_has_one_picture_on_each_side(window: Window, width: int, heigh
         np.testing.assert_array_equal(both[:, split + 1 + blurred :], alone[:, split + 1 + blurred :])
         lines = (both == 255).all(axis=2)[:, start:stop].all(axis=0)
         assert np.flatnonzero(lines).tolist() == [split - start]
+    window.wipe_share = -0.5  # what is outside counts as the edge
+    np.testing.assert_array_equal(shown(ours, theirs), alone)
     window.wipe_share = 0.0
     np.testing.assert_array_equal(shown(ours, theirs), alone)
     window.wipe_share = 1.0
@@ -291,7 +298,7 @@ def test_300_frames_leave_nothing_behind(window: Window) -> None:
     def play(frames: int) -> int:
         for index in range(frames):
             picture = pictures[index % 2]
-            window.present(picture, left=picture, overlay=[f"frame {index}"])
+            window.present(picture, left=picture, overlay=["x" * (1 + index % 50)] * 15)
             window.actions()
         return int(psutil.Process().memory_info().rss)
 
@@ -318,12 +325,56 @@ def test_sdl_is_shut_down_whatever_happens() -> None:
     assert not sdl2.SDL_WasInit(sdl2.SDL_INIT_VIDEO)
 
 
-def test_no_display_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SDL_VIDEODRIVER", "x11")
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="what handles a signal is asked of Linux")
+def test_signals_stay_the_programs() -> None:
+    """SDL would make an event of SIGTERM, which nobody may be polling."""
+
+    def caught() -> list[bool]:
+        (mask,) = re.findall(r"^SigCgt:\s+(\w+)$", Path("/proc/self/status").read_text(), re.MULTILINE)
+        return [bool(int(mask, 16) >> (signum - 1) & 1) for signum in (signal.SIGINT, signal.SIGTERM)]
+
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    with Window("test"):
+        assert caught() == [True, False]
+
+
+@pytest.mark.parametrize("driver", ["x11", None], ids=["asked for", "any"])
+def test_no_display_is_one_sentence(monkeypatch: pytest.MonkeyPatch, driver: str | None) -> None:
+    """Where SDL may choose, it falls back to drawing where nobody sees it, without a word."""
     monkeypatch.setenv("DISPLAY", ":4711")
-    with pytest.raises(OutputError, match=r"^no window can be opened, as SDL finds no display \(.+\): set DISPLAY .*libsdl2-2\.0-0[^\n]*$"):
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.delenv("SDL_VIDEODRIVER")
+    if driver:
+        monkeypatch.setenv("SDL_VIDEODRIVER", driver)
+    with pytest.raises(OutputError, match=r"^no window can be opened, as SDL finds no display.*: set DISPLAY .*libsdl2-2\.0-0[^\n]*$"):
         Window("test")
     assert not sdl2.SDL_WasInit(0)
+
+
+@pytest.mark.parametrize("renderer", ["software", "opengl", None], ids=["software", "OpenGL", "any"])
+def test_a_real_window_shows_the_same(monkeypatch: pytest.MonkeyPatch, renderer: str | None) -> None:
+    """As the X server has it, through SDL's renderers."""
+    ours, theirs = (noise(320, 180, seed) for seed in (1, 2))
+    with headless_screen(320, 180) as screen:
+        monkeypatch.setenv("SDL_VIDEODRIVER", "x11")
+        monkeypatch.setenv("DISPLAY", screen.display)
+        if renderer:
+            monkeypatch.setenv("SDL_RENDER_DRIVER", renderer)
+        with Window("test") as window:
+            window.present(theirs)
+            window.present(ours, left=theirs)
+            time.sleep(0.2)  # an OpenGL picture may come after present has returned
+            shown = screen.picture().astype(int)
+            for tags in (BT601, BT709, BT601_FULL):
+                frame = Frame(np.full((180, 320), 120, np.uint8), *(np.full((90, 160), code, np.uint8) for code in (90, 170)), colour=tags)
+                window.present(frame)
+                time.sleep(0.2)
+                assert np.abs(screen.picture() - expected(frame)).max() <= 2.5
+    # OpenGL raises chroma linearly: luma's noise is told from the other picture's all the same.
+    for side, frame in ((slice(0, 158), theirs), (slice(162, 320), ours)):
+        distance = np.abs(shown - expected(frame))[:, side]
+        assert distance.mean() < 25 if renderer == "opengl" else distance.max() <= 2.5
+    assert (shown[:, 160] == 255).all()
 
 
 def test_no_library_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
