@@ -57,7 +57,8 @@ class ModelSpec:
 def load_session(model: Path, provider: str, threads: int) -> tuple[ort.InferenceSession, ModelSpec]:
     """Read an artifact, check that it is one the client understands, and make a session of it.
 
-    The runtime is given bytes, never a path, so a model cannot make it read other files. Raises ModelError or ProviderError.
+    `provider` is one of ORT_PROVIDERS. The runtime is given bytes, never a path, so a model cannot make it read other files.
+    Raises ModelError or ProviderError.
     """
     _check_provider(provider)
     content = read_artifact(model)
@@ -82,8 +83,6 @@ class _NotUnderstood(Exception):
 
 
 def _check_provider(provider: str) -> None:
-    if provider not in ORT_PROVIDERS:
-        raise ProviderError(f"there is no provider {provider!r}: choose one of {', '.join(ORT_PROVIDERS)}")
     if ORT_PROVIDERS[provider] not in ort.get_available_providers():
         raise ProviderError(f"this ONNX Runtime has no {provider} provider: install it with pip install 'gamesr[{provider}]'")
 

@@ -55,6 +55,8 @@ class Runtime(Protocol):
 
 def load_runtime(model: Path, provider: str, threads: int) -> tuple[Runtime, ModelSpec]:
     """An artifact on one of PROVIDERS, and what it says of itself; raises ModelError or ProviderError."""
+    if provider not in PROVIDERS:
+        raise ProviderError(f"there is no provider {provider!r}: choose one of {', '.join(PROVIDERS)}")
     if provider not in OPENVINO:
         session, spec = load_session(model, provider, threads)
         return OrtRuntime(session, "cuda" if provider == "cuda" else "cpu"), spec

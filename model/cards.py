@@ -46,15 +46,20 @@ def training_command(config: TrainConfig) -> str:
 
 def card_page(name: str, scale: int, card: Card) -> str:
     """The card as Markdown."""
+    precision, made_from = "float32", []
+    if "quantized_from" in card:
+        precision = "int8"
+        made_from = [f"- Quantized from the float32 artifact {card['quantized_from']} (SHA-256) on {', '.join(card['calibration'])}"]
     earlier = [
         f"- Built on: `{run['command']}`, {run['steps']:,} steps in {run['training_seconds'] / 3600:.2f} h" for run in card["before"]
     ]
     lines = [
         f"# {name} x{scale}",
         "",
-        f"{card['parameters']:,} parameters ({card['parameters_in_training']:,} in training), float32; "
+        f"{card['parameters']:,} parameters ({card['parameters_in_training']:,} in training), {precision}; "
         f"{card['macs_540p'] / 1e9:.2f} GMAC for a frame of 960x540.",
         "",
+        *made_from,
         *earlier,
         f"- Command: `{card['command']}`",
         f"- Commit: {card['commit']}",
@@ -62,7 +67,7 @@ def card_page(name: str, scale: int, card: Card) -> str:
         f"- Trained on: {', '.join(card['footage']['train'])}",
         f"- Held out while training: {', '.join(card['footage']['validate'])}",
         "",
-        "The first frames of the held-out scenes, PSNR-Y in dB:",
+        f"The first frames of the held-out scenes, PSNR-Y in dB{', before it was quantized' if made_from else ''}:",
         "",
         "| scene and input | bicubic | this model | gain |",
         "|---|---|---|---|",

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from client.artifact import load_session
 from client.errors import GamesrError, InputError, ModelError
 from client.models import WEIGHTS
 from client.runtime import PROVIDERS
@@ -26,8 +27,8 @@ from model.export import BASELINES, export_baseline, export_network
 from model.footage import Degradation, FootageCache, load_scenes
 from model.stability import CASES, CLIP_FRAMES, HEADER, run_cases, table_row
 from model.train import TrainConfig, Trainer, load_checkpoint, network_of
-from model.trial import Subject
-from model.verify import crop, network_of_artifact, parity, parse_size
+from model.trial import SHOWN_STEPS, Subject, bounds_of
+from model.verify import PARITY_HEADER, StepError, crop, network_of_artifact, parity, parity_row, parse_size
 
 TRAIN_EXAMPLES = """\
 The footage list is a TOML file of scenes (gamesr-footage makes one); scenes are split by map or track. A run lives in one
@@ -40,6 +41,7 @@ folder and goes on where it stopped when the same command is given again:
 VERIFY_EXAMPLES = """\
 examples:
   gamesr-verify client/weights/gamesr_x2.onnx tests/footage/oa_koth1_540p.mp4
+  gamesr-verify client/weights/gamesr_x2.onnx tests/footage/oa_koth1_540p.mp4 --provider cpu openvino openvino-bfloat16
   gamesr-verify client/weights/gamesr_x2.onnx tests/footage/oa_koth1_540p.mp4 --hard short
   gamesr-verify client/weights/gamesr_x2.onnx --hard full --cases still fade
 
@@ -108,7 +110,7 @@ def train_main(argv: Sequence[str] | None = None) -> int:
         )
         trainer.run(validate_every=arguments.validate_every, progress=sys.stderr.isatty())
 
-    return _run(parser, arguments, work, f"stopped; the same command goes on from the last checkpoint in {arguments.run}")
+    return run_command(parser, arguments, work, f"stopped; the same command goes on from the last checkpoint in {arguments.run}")
 
 
 def export_main(argv: Sequence[str] | None = None) -> int:
@@ -136,7 +138,7 @@ def export_main(argv: Sequence[str] | None = None) -> int:
         path.with_suffix(".md").write_text(card_page(arguments.name, network.scale, card))
         print(path)
 
-    return _run(parser, arguments, work, "stopped")
+    return run_command(parser, arguments, work, "stopped")
 
 
 def verify_main(argv: Sequence[str] | None = None) -> int:
@@ -157,13 +159,25 @@ def verify_main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--hard", choices=("short", "full"), help="the hard cases: short takes seconds, full up to 10,000 frames a case")
     parser.add_argument("--cases", nargs="+", choices=[case.name for case in CASES], metavar="CASE", help="only these hard cases")
-    parser.add_argument("--provider", choices=PROVIDERS, default="cpu", help="what runs the hard cases (default: %(default)s)")
-    parser.add_argument("--json", action="store_true", help="a JSON line a step, or a hard case, instead of the table")
+    parser.add_argument(
+        "--provider",
+        nargs="+",
+        choices=PROVIDERS,
+        default=["cpu"],
+        metavar="PROVIDER",
+        help=f"what runs the artifact, of {', '.join(PROVIDERS)}; of the hard cases one, else any number beside each other (default: cpu)",
+    )
+    parser.add_argument(
+        "--weights", type=Path, metavar="FLOAT32", help="the .onnx artifact that an int8 one was made from: the reference's"
+    )
+    parser.add_argument("--json", action="store_true", help="a JSON line a step and provider, or a hard case, instead of the table")
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     arguments = parser.parse_args(argv)
     if arguments.hard is None and (arguments.clip is None or arguments.cases):
         parser.error("CLIP may be left out, and --cases given, with --hard only")
-    return _run(parser, arguments, lambda: _verify_hard(arguments) if arguments.hard else _verify_parity(arguments), "stopped")
+    if arguments.hard and len(arguments.provider) > 1:
+        parser.error("--hard takes one --provider")
+    return run_command(parser, arguments, lambda: _verify_hard(arguments) if arguments.hard else _verify_parity(arguments), "stopped")
 
 
 def _verify_parity(arguments: argparse.Namespace) -> None:
@@ -171,25 +185,30 @@ def _verify_parity(arguments: argparse.Namespace) -> None:
     frames = [crop(frame, width, height) for frame in read_frames(arguments.clip)]
     if not frames:
         raise InputError(f"no frame of {arguments.clip} could be decoded")
-    shown = {1, 10, 100, arguments.steps}
-    worst = 0
-    for error in parity(arguments.model, frames, arguments.steps):
-        worst = max(worst, error.max_code_error)
+    _, spec = load_session(arguments.model, "cpu", 1)
+    allowed = {provider: bounds_of(spec, provider).codes for provider in arguments.provider}
+    errors: dict[str, list[StepError]] = {provider: [] for provider in arguments.provider}
+    if not arguments.json:
+        print(PARITY_HEADER)
+    for error in parity(arguments.model, frames, arguments.steps, providers=list(errors), weights=arguments.weights):
+        errors[error.provider].append(error)
         if arguments.json:
             print(json.dumps(asdict(error)))
-        elif error.step in shown or error.step % 100 == 0:
-            picture = f"picture within {error.max_code_error} code values, {error.differing_pixels:.1e} of the samples differ"
-            state = f"state within {error.max_state_error:.1e}, RMS {error.rms_state_error:.1e}"
-            print(f"step {error.step:5}: {picture}; {state}")
-    if worst > 1:
-        raise ModelError(f"{arguments.model} differs from its float64 reference by {worst} code values")
+        elif error.step in (*SHOWN_STEPS, arguments.steps):
+            print(parity_row(f"{error.step:,}", [error]), flush=True)
+    if not arguments.json:
+        print("\n".join(parity_row("any", of_provider) for of_provider in errors.values()))
+    for provider, of_provider in errors.items():
+        worst = max(error.max_code_error for error in of_provider)
+        if worst > allowed[provider]:
+            raise ModelError(f"{arguments.model} on {provider} differs from its float64 reference by {worst} code values")
 
 
 def _verify_hard(arguments: argparse.Namespace) -> None:
     full = arguments.hard == "full"
     width, height = parse_size(arguments.crop or ("160x96" if full else "64x48"))
-    upscaler = OnnxUpscaler(arguments.model, provider=arguments.provider)
-    network = network_of_artifact(arguments.model) if "network" in upscaler.spec.card else None
+    upscaler = OnnxUpscaler(arguments.model, provider=arguments.provider[0])
+    network = network_of_artifact(arguments.model, arguments.weights) if "network" in upscaler.spec.card else None
     clip = list(islice(read_frames(arguments.clip), CLIP_FRAMES[full])) if arguments.clip else []
     if arguments.clip and not clip:
         raise InputError(f"no frame of {arguments.clip} could be decoded")
@@ -252,10 +271,10 @@ def evaluate_main(argv: Sequence[str] | None = None) -> int:
         if not arguments.json:
             print(table(measured))
 
-    return _run(parser, arguments, work, f"stopped; the same command goes on from the rows in {arguments.rows}")
+    return run_command(parser, arguments, work, f"stopped; the same command goes on from the rows in {arguments.rows}")
 
 
-def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace, work: Callable[[], None], interrupted: str) -> int:
+def run_command(parser: argparse.ArgumentParser, arguments: argparse.Namespace, work: Callable[[], None], interrupted: str) -> int:
     """The exit status: 1 and one sentence for what went wrong, 130 for Ctrl-C."""
     try:
         work()

@@ -24,7 +24,6 @@ Run = Callable[[Subject, int], Outcome]
 CLIP_FRAMES = {True: 60, False: 12}  # in full and in short: what of the clip is played forwards and backwards
 BITS_PER_PIXEL = 500_000 / (960 * 540 * 60)  # 500 kbps at 540p and 60 frames/s
 PSNR_DRIFT_DB = 0.01
-FLICKERING = 1e-4  # share of the samples that may go back and forth, by one code
 STATE_AT_REST = 1e-2  # RMS change of the state from frame to frame at the end of a still
 
 
@@ -119,7 +118,7 @@ def _still(subject: Subject, steps: int) -> Outcome:
         f"{watch.flickering:.1e} of the samples flicker",
         (abs(watch.psnr_change_db) <= PSNR_DRIFT_DB, f"PSNR drifts by {watch.psnr_change_db:+.4f} dB"),
         (watch.largest_change <= 1, f"samples of a still change by {watch.largest_change} codes"),
-        (watch.flickering <= FLICKERING, f"{watch.flickering:.1e} of the samples flicker"),
+        (watch.flickering <= subject.bounds.flickering, f"{watch.flickering:.1e} of the samples flicker"),
         (watch.state_change <= STATE_AT_REST, f"the state still moves by {watch.state_change:.1e} a frame (RMS)"),
     )
 

@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from client.artifact import ModelSpec
 from client.errors import ModelError
 from client.frames import Frame
+from client.runtime import BFLOAT16
 from client.timing import LatencySummary
 from client.upscaler import OnnxUpscaler
 from model.planes import Network
@@ -29,18 +31,32 @@ class Bounds:
 
     `codes` is the largest error of a picture in code values and `differing` the share of samples that may have one.
     `state` is the largest error of the state relative to the largest value in it (at least 1: cells that integrate for
-    long are large, and a float's error is relative), `drift` how much its RMS may grow in 1,000 frames.
+    long are large, and a float's error is relative), `drift` how much its RMS may grow in 1,000 frames. `flickering` is the
+    share of a still's samples that may go back and forth, by one code.
     """
 
     codes: int
     differing: float
     state: float
     drift: float
+    flickering: float
 
 
 # Rounding to codes turns an error of e into a differing sample for about 2 * e of the samples: float32 on values of a few
 # hundred is off by 1e-5 to 1e-4. What was measured, and what the bounds leave above it: docs/stability.md.
-BOUNDS = {"float32": Bounds(codes=1, differing=1e-3, state=3e-5, drift=1e-6)}
+BOUNDS = {
+    "float32": Bounds(codes=1, differing=1e-3, state=3e-5, drift=1e-6, flickering=1e-4),
+    "bfloat16": Bounds(codes=4, differing=0.4, state=0.1, drift=1e-3, flickering=0.03),
+    "int8": Bounds(codes=16, differing=0.6, state=0.5, drift=1e-2, flickering=0.03),
+}
+
+
+def bounds_of(spec: ModelSpec, provider: str) -> Bounds:
+    """Those of what it computes in: int8 is the coarsest wherever it runs. Raises ModelError for a precision that has none."""
+    precision = "bfloat16" if (spec.precision, provider) == ("float32", BFLOAT16) else spec.precision
+    if precision not in BOUNDS:
+        raise ModelError(f"no bounds are stated for the precision {precision} of {spec.name}")
+    return BOUNDS[precision]
 
 
 @dataclass(frozen=True)
@@ -62,12 +78,11 @@ class Subject:
     progress: bool = False
 
     def __post_init__(self) -> None:
-        if self.upscaler.spec.precision not in BOUNDS:
-            raise ModelError(f"no bounds are stated for the precision {self.upscaler.spec.precision} of {self.path}")
+        bounds_of(self.upscaler.spec, self.upscaler.provider)
 
     @property
     def bounds(self) -> Bounds:
-        return BOUNDS[self.upscaler.spec.precision]
+        return bounds_of(self.upscaler.spec, self.upscaler.provider)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from onnx import numpy_helper
 from client.artifact import load_session
 from client.errors import InputError, ModelError
 from client.frames import Frame, Plane
+from client.quality import psnr_db, squared_error
 from client.upscaler import OnnxUpscaler, State
 from model.catalogue import described_network
 from model.export import to_codes
@@ -25,29 +26,42 @@ from model.planes import Network, Planes
 
 @dataclass(frozen=True)
 class StepError:
-    """What one step's result differs by: pictures in code values (planes Y, U, V together), states in their own units."""
+    """What one step's result differs by: pictures in code values (planes Y, U, V together), states in their own units.
 
+    `provider` is what ran the artifact. `p999_code_error` is the 99.9th percentile of all samples' errors, `psnr_y_db` that of
+    the luma against the reference's rounded picture, None where the two are equal.
+    """
+
+    provider: str
     step: int
     max_code_error: int
+    p999_code_error: int
     differing_pixels: float
+    psnr_y_db: float | None
     max_state_error: float
     rms_state_error: float
 
 
-def network_of_artifact(artifact: Path) -> Network:
-    """The fused network in float64 with an artifact's weights; raises ModelError when it does not say what network it is."""
+def network_of_artifact(artifact: Path, weights: Path | None = None) -> Network:
+    """The fused network in float64 with an artifact's weights; raises ModelError when it does not say what network it is.
+
+    The weights of an int8 artifact are those of the float32 artifact that it was made from, `weights`.
+    """
     _, spec = load_session(artifact, "cpu", 1)
     if "network" not in spec.card:
         raise ModelError(f"{artifact} is no network: only a trained artifact has weights to verify")
+    if weights is not None and load_session(weights, "cpu", 1)[1].sha256 != spec.card.get("quantized_from"):
+        raise ModelError(f"{artifact} was not made from {weights}")
+    if weights is None and spec.precision == "int8":
+        raise ModelError(f"{artifact} has rounded weights: name the float32 artifact that it was made from with --weights")
     network = described_network(spec.card["network"]).deployed()
-    weights = {
-        t.name.removeprefix("network."): torch.from_numpy(numpy_helper.to_array(t).copy()) for t in onnx.load(artifact).graph.initializer
-    }
+    initializers = onnx.load(weights or artifact).graph.initializer
+    found = {t.name.removeprefix("network."): torch.from_numpy(numpy_helper.to_array(t).copy()) for t in initializers}
     shapes = {name: weight.shape for name, weight in network.state_dict().items()}
-    missing = shapes.keys() - weights.keys()
+    missing = shapes.keys() - found.keys()
     if missing:
         raise ModelError(f"{artifact} lacks the weights {', '.join(sorted(missing))}")
-    network.load_state_dict({name: weights[name].reshape(shape) for name, shape in shapes.items()})  # slopes of PReLU lie over channels
+    network.load_state_dict({name: found[name].reshape(shape) for name, shape in shapes.items()})  # slopes of PReLU lie over channels
     return network.double().eval()
 
 
@@ -112,43 +126,92 @@ class Played:
 
 def play(upscaler: OnnxUpscaler, network: Network | None, frames: Iterable[Frame]) -> Iterator[Played]:
     """Frames of one size through an artifact, as the client runs it, and through its reference, each with its own state."""
-    state: State | None = None
+    return (played for (played,) in play_together([upscaler], network, frames))
+
+
+def play_together(upscalers: Sequence[OnnxUpscaler], network: Network | None, frames: Iterable[Frame]) -> Iterator[list[Played]]:
+    """The same through several upscalers and one reference, in their order, frame by frame; every one has its own state."""
+    states: list[State] = []
     reference: Reference | None = None
     for step, frame in enumerate(frames, 1):
-        if state is None:
-            state = upscaler.initial_state(frame.height, frame.width)
+        if not states:
+            states = [upscaler.initial_state(frame.height, frame.width) for upscaler in upscalers]
             reference = Reference(network, frame.height, frame.width) if network else None
-        begin_ns = time.perf_counter_ns()
-        picture, state = upscaler.step(frame, state)
-        duration_ns = time.perf_counter_ns() - begin_ns
-        tensors = state.tensors()
-        error = _error(step, picture, tensors, reference.step(frame), reference.state()) if reference else None
-        yield Played(picture, duration_ns, state.restarted, tensors, error)
+        expected = None if reference is None else (reference.step(frame), reference.state())
+        together = []
+        for index, upscaler in enumerate(upscalers):
+            begin_ns = time.perf_counter_ns()
+            picture, state = upscaler.step(frame, states[index])
+            duration_ns = time.perf_counter_ns() - begin_ns
+            states[index] = state
+            tensors = state.tensors()
+            error = None if expected is None else step_error(upscaler.provider, step, picture, tensors, *expected)
+            together.append(Played(picture, duration_ns, state.restarted, tensors, error))
+        yield together
 
 
-def parity(artifact: Path, frames: list[Frame], steps: int, *, threads: int = 1) -> Iterator[StepError]:
-    """Run both for `steps` frames, each carrying its own state from zeros, and give the difference after every step.
+def parity(
+    artifact: Path,
+    frames: list[Frame],
+    steps: int,
+    *,
+    providers: Sequence[str] = ("cpu",),
+    weights: Path | None = None,
+    threads: int = 1,
+) -> Iterator[StepError]:
+    """Run an artifact for `steps` frames, its state carried from zeros, and give the difference from its reference after every step.
 
-    The artifact runs in ONNX Runtime on the CPU at its own precision; the reference is float64 throughout and rounds its
-    pictures only at the end, as the artifact does.
+    Each of `providers` runs it at its own precision, with its own state, and gives an error a step, in their order; the
+    reference is float64 throughout and rounds its pictures only at the end, as the artifact does. Of an int8 artifact it has
+    the weights of the float32 one, `weights`.
     """
-    network = network_of_artifact(artifact)
-    for played in play(OnnxUpscaler(artifact, threads=threads), network, there_and_back(frames, steps)):
-        assert played.error is not None
-        yield played.error
+    upscalers = [OnnxUpscaler(artifact, provider=provider, threads=threads) for provider in providers]
+    for together in play_together(upscalers, network_of_artifact(artifact, weights), there_and_back(frames, steps)):
+        for played in together:
+            assert played.error is not None
+            yield played.error
 
 
-def _error(
-    step: int, picture: Frame, state: list[NDArray[np.floating]], planes: list[Plane], expected: list[NDArray[np.float64]]
-) -> StepError:
-    difference = np.concatenate(
-        [(wanted.astype(np.int16) - found).ravel() for wanted, found in zip(planes, (picture.y, picture.u, picture.v), strict=True)]
+PARITY_HEADER = "| frame | provider | max | 99.9% | differing | PSNR-Y | state | RMS |\n|---|---|---|---|---|---|---|---|"
+
+
+def parity_row(frame: str, errors: Sequence[StepError]) -> str:
+    """A line of Markdown under `PARITY_HEADER`: the worst of the errors, all of one provider."""
+    found = [error.psnr_y_db for error in errors if error.psnr_y_db is not None]
+    cells = (
+        frame,
+        errors[0].provider,
+        str(max(error.max_code_error for error in errors)),
+        str(max(error.p999_code_error for error in errors)),
+        f"{max(error.differing_pixels for error in errors):.1e}",
+        f"{min(found):.1f}" if found else "equal",
+        f"{max(error.max_state_error for error in errors):.1e}",
+        f"{max(error.rms_state_error for error in errors):.1e}",
     )
+    return f"| {' | '.join(cells)} |"
+
+
+def step_error(
+    provider: str,
+    step: int,
+    picture: Frame,
+    state: list[NDArray[np.floating]],
+    planes: list[Plane],
+    expected: list[NDArray[np.float64]],
+) -> StepError:
+    """How far a picture and a state are from the planes and the state of the reference."""
+    pairs = list(zip(planes, (picture.y, picture.u, picture.v), strict=True))
+    distances = np.concatenate([np.abs(wanted.astype(np.int16) - found).ravel() for wanted, found in pairs])
+    upto = np.bincount(distances).cumsum()  # samples whose error is 0, 0 or 1, and so on
+    squared = squared_error(*pairs[0])
     drift = np.concatenate([(a - b).ravel() for a, b in zip(expected, state, strict=True)] or [np.zeros(1)])
     return StepError(
+        provider,
         step,
-        int(np.abs(difference).max()),
-        float(np.count_nonzero(difference) / difference.size),
+        len(upto) - 1,
+        int(np.searchsorted(upto, 0.999 * distances.size)),
+        float(1 - upto[0] / distances.size),
+        psnr_db(squared / picture.y.size) if squared else None,
         float(np.abs(drift).max()),
         float(np.sqrt(np.square(drift).mean())),
     )

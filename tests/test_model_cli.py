@@ -9,6 +9,7 @@ import pytest
 
 from client.upscaler import OnnxUpscaler
 from model.cli import evaluate_main, export_main, train_main, verify_main
+from model.verify import PARITY_HEADER
 from tests.moving import write_footage
 
 TINY = ["--steps", "4", "--batch", "2", "--patch", "16", "--frames", "4", "--window", "2", "--degradations", "area"]
@@ -53,8 +54,11 @@ def test_verify_holds_the_artifact_against_float64(workshop: Path, capsys: pytes
     rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [row["step"] for row in rows] == list(range(1, 13))
     assert max(row["max_code_error"] for row in rows) <= 1
-    assert verify_main(command) == 0
-    assert "step    12: picture within" in capsys.readouterr().out
+    assert verify_main([*command, "--provider", "cpu", "openvino"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "\n".join(lines[:2]) == PARITY_HEADER and len({line.count("|") for line in lines}) == 1
+    shown = [tuple(line.split(" | ")[:2]) for line in lines[2:]]
+    assert shown == [(f"| {frame}", provider) for frame in ("1", "10", "12", "any") for provider in ("cpu", "openvino")]
     assert verify_main([*command[:-1], "48x33"]) == 1
     assert "not a size" in capsys.readouterr().err
 

@@ -23,8 +23,8 @@ from model.export import export_network
 from model.network import GameSR, NetworkConfig
 from model.probes import same_picture
 from model.stability import CASES, HEADER, Case, run_cases, table_row
-from model.trial import Outcome, Subject, tally
-from model.verify import Played, StepError, network_of_artifact
+from model.trial import BOUNDS, Outcome, Subject, bounds_of, tally
+from model.verify import Played, StepError, network_of_artifact, step_error
 from tests.moving import write_footage
 
 Make = Callable[[int, int, int], Iterator[Frame]]
@@ -226,7 +226,7 @@ def test_growing_errors_and_lost_states_are_failures(folder: Path) -> None:
 
     def played(slope: float) -> Iterator[Played]:
         for step in range(1, 301):
-            yield Played(picture, 1000, False, state, StepError(step, 0, 0.0, 1e-7, 1e-7 + slope * step))
+            yield Played(picture, 1000, False, state, StepError("cpu", step, 0, 0, 0.0, None, 1e-7, 1e-7 + slope * step))
 
     assert tally(tested, played(0.0)).passed
     drifting = tally(tested, played(1e-8))
@@ -249,6 +249,26 @@ def test_a_still_that_flickers_or_drifts_fails(folder: Path, monkeypatch: pytest
     assert any(fails in failure for failure in outcome.failures), outcome.failures
 
 
+def test_an_error_is_that_of_its_samples() -> None:
+    wanted, found = (np.zeros(shape, np.uint8) for shape in ((40, 50), (20, 25), (20, 25))), np.zeros((40, 50), np.uint8)
+    found[:2, 0] = 3, 9  # two of 3,000 samples: three may lie above the percentile
+    chroma = np.zeros((20, 25), np.uint8)
+    error = step_error("cpu", 7, Frame(found, chroma, chroma), [np.float32([1, 2])], list(wanted), [np.array([1.0, 2.5])])
+    assert (error.step, error.max_code_error, error.p999_code_error) == (7, 9, 0)
+    assert error.differing_pixels == pytest.approx(2 / 3000) and error.psnr_y_db == pytest.approx(psnr_db(90 / 2000))
+    assert (error.max_state_error, error.rms_state_error) == (0.5, pytest.approx(0.5 / np.sqrt(2)))
+    found[2:4, 0] = 3, 2  # four do: the least of them is the percentile
+    again = step_error("cpu", 8, Frame(found, chroma, chroma), [], [np.zeros_like(p) for p in (found, chroma, chroma)], [])
+    assert again.p999_code_error == 2 and again.rms_state_error == 0
+
+
+def test_bounds_are_those_of_what_computes() -> None:
+    spec = OnnxUpscaler(find_model("gamesr", 2), threads=1).spec
+    exact, rounded = bounds_of(spec, "openvino"), bounds_of(spec, "openvino-bfloat16")
+    assert exact == bounds_of(spec, "cpu") == BOUNDS["float32"] and rounded == BOUNDS["bfloat16"] != exact
+    assert bounds_of(replace(spec, precision="int8"), "openvino-bfloat16") == BOUNDS["int8"]
+
+
 def test_a_precision_without_bounds_is_refused(folder: Path, tmp_path: Path) -> None:
     proto = onnx.load(folder / "tiny.onnx")
     next(p for p in proto.metadata_props if p.key == "precision").value = "float8"
@@ -261,6 +281,12 @@ def test_a_clip_may_be_missing_and_cases_be_named_with_hard_only(arguments: list
     with pytest.raises(SystemExit):
         verify_main(["model.onnx", *arguments])
     assert "with --hard only" in capsys.readouterr().err
+
+
+def test_hard_cases_take_one_provider(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        verify_main(["model.onnx", "--hard", "short", "--provider", "cpu", "openvino"])
+    assert "one --provider" in capsys.readouterr().err
 
 
 def test_a_row_says_what_it_does_not_know() -> None:

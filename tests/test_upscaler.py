@@ -293,7 +293,7 @@ def test_a_missing_provider_names_what_to_install(model_file: ModelFile, monkeyp
     monkeypatch.setattr(ort, "get_available_providers", lambda: ["CPUExecutionProvider"])
     with pytest.raises(ProviderError, match=r"pip install 'gamesr\[cuda\]'"):
         OnnxUpscaler(model_file(), provider="cuda")
-    with pytest.raises(ProviderError, match="no provider 'tpu'"):
+    with pytest.raises(ProviderError, match="no provider 'tpu': choose one of cpu, cuda, openvino, openvino-bfloat16"):
         OnnxUpscaler(model_file(), provider="tpu")
 
 

@@ -1,0 +1,54 @@
+"""gamesr-quantize: an int8 artifact of a float32 one."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from client.errors import InputError
+from client.models import WEIGHTS
+from client.upscaler import OnnxUpscaler
+from model.cards import card_page
+from model.cli import run_command
+from model.quantize import CALIBRATION_FRAMES, quantize
+
+EPILOG = """\
+example:
+  gamesr-quantize client/weights/live_x2.onnx live-int8 match_540p.mp4 race_540p.mp4
+
+The clips are what the artifact will be given: low resolution, compressed, of several scenes, none of them a test scene. How much
+is lost and gained, and where: docs/stability.md. To see it for a model of your own:
+
+  gamesr-verify client/weights/live-int8_x2.onnx test_540p.mp4 --weights client/weights/live_x2.onnx --provider cpu openvino
+  gamesr-evaluate FOOTAGE.toml --models live live-int8 --scales 2
+  gamesr-bench --model live --model live-int8 --provider openvino
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit status."""
+    parser = argparse.ArgumentParser(
+        prog="gamesr-quantize",
+        description="Write an int8 artifact of a float32 one, its ranges calibrated on footage, its model card beside it.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("model", type=Path, help="the float32 .onnx artifact of a trained GameSR network")
+    parser.add_argument("name", help="the new model's name; its files are NAME_xSCALE.onnx and .md")
+    parser.add_argument("clips", type=Path, nargs="+", metavar="clip", help="low-resolution videos of several scenes")
+    parser.add_argument("--frames", type=int, default=CALIBRATION_FRAMES, help="of each clip, from its start (default: %(default)s)")
+    parser.add_argument("--folder", type=Path, default=WEIGHTS, help="where to (default: %(default)s)")
+    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
+    arguments = parser.parse_args(argv)
+
+    def work() -> None:
+        if arguments.frames < 1:
+            raise InputError("--frames must be 1 or more")
+        scale = OnnxUpscaler(arguments.model, threads=1).spec.scale
+        path = arguments.folder / f"{arguments.name}_x{scale}.onnx"
+        card = quantize(arguments.model, path, arguments.clips, name=arguments.name, frames=arguments.frames)
+        path.with_suffix(".md").write_text(card_page(arguments.name, scale, card))
+        print(path)
+
+    return run_command(parser, arguments, work, "stopped")

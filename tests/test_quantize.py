@@ -1,0 +1,162 @@
+"""int8 artifacts: what is in 8 bits and what is not, how near they come, what they say of themselves, what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import numpy_helper
+
+from client.errors import InputError, ModelError
+from client.frames import Frame
+from client.upscaler import OnnxUpscaler
+from model import hard_cases
+from model.cli import export_main, train_main, verify_main
+from model.export import export_baseline, export_network
+from model.network import GameSR, NetworkConfig
+from model.quantize import quantize, split_merged_head
+from model.quantize_cli import main
+from tests.moving import picture, write_footage
+
+NETWORKS = {  # one without a state whose base is merged into its head, and one with a state whose base is apart
+    "merged": NetworkConfig(unshuffle=4, channels=8, expanded=8, blocks=2, recurrent=False, learned_base=True, lean=True),
+    "recurrent": NetworkConfig(channels=8, expanded=8, blocks=1, learned_base=True, skip=True),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Each network as NAME.onnx and NAME-int8.onnx, and the clip that those were calibrated on."""
+    folder = tmp_path_factory.mktemp("quantize")
+    write_footage(folder)
+    for name, config in NETWORKS.items():
+        torch.manual_seed(0)
+        network = GameSR(config)
+        with torch.no_grad():
+            for parameter in network.parameters():
+                parameter.add_(0.03 * torch.randn_like(parameter))
+        export_network(network.eval(), folder / f"{name}.onnx", name=name, card={"steps": 0})
+        quantize(folder / f"{name}.onnx", folder / f"{name}-int8.onnx", [folder / "clip.mkv"], name=f"{name}-int8", frames=6)
+    return folder
+
+
+def codes(model: Path, frames: list[Frame], provider: str = "cpu") -> np.ndarray:
+    """All samples of all pictures in one row."""
+    return np.concatenate([plane.ravel() for p in played(model, frames, provider) for plane in (p.y, p.u, p.v)]).astype(np.int16)
+
+
+def played(model: Path, frames: list[Frame], provider: str) -> Iterator[Frame]:
+    upscaler = OnnxUpscaler(model, provider=provider, threads=1)
+    state = upscaler.initial_state(frames[0].height, frames[0].width)
+    for frame in frames:
+        upscaled, state = upscaler.step(frame, state)
+        yield upscaled
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("provider", ["cpu", "openvino"])
+def test_int8_comes_near_the_float32_artifact(folder: Path, name: str, provider: str) -> None:
+    frames = [picture(t, 96, 144) for t in range(20)]
+    error = codes(folder / f"{name}-int8.onnx", frames, provider) - codes(folder / f"{name}.onnx", frames)
+    bicubic = folder / "bicubic.onnx"
+    export_baseline("bicubic", 2, bicubic)
+    done = codes(folder / f"{name}.onnx", frames) - codes(bicubic, frames)
+    assert 0 < np.square(error.astype(float)).mean() < 0.01 * np.square(done.astype(float)).mean()
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_weights_are_symmetric_per_channel_and_what_must_stay_float_does(folder: Path, name: str) -> None:
+    graph = onnx.load(folder / f"{name}-int8.onnx").graph
+    tensors = {t.name: numpy_helper.to_array(t) for t in graph.initializer}
+    source = {node.output[0]: node for node in graph.node}
+    float_weights, int8_weights = set(), set()
+    for conv in (node for node in graph.node if node.op_type == "Conv"):
+        if conv.input[1] in tensors:
+            float_weights.add(conv.input[1].removeprefix("network.").removesuffix(".weight"))
+            continue
+        weight, scales, zeros = (tensors[tensor] for tensor in source[conv.input[1]].input)
+        assert weight.dtype == np.int8 and not zeros.any() and scales.shape == weight.shape[:1]
+        assert source[source[conv.input[0]].input[0]].op_type == "QuantizeLinear"
+        assert tensors[source[conv.input[0]].input[2]].dtype == np.uint8
+        int8_weights.add(source[conv.input[1]].input[0].removeprefix("network.").removesuffix(".weight_quantized"))
+    if name == "merged":
+        assert int8_weights == {"stem", "blocks.0.conv", "blocks.1.conv", "head.features"} and float_weights == {"head.cells"}
+    else:
+        assert int8_weights == {"stem", "blocks.0.conv"}
+        assert float_weights == {"lstm.gates", "head", "luma_base", "chroma_base"}
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_it_is_the_same_model_to_the_client_but_for_its_precision(folder: Path, name: str) -> None:
+    ours, theirs = (OnnxUpscaler(folder / f"{stem}.onnx", threads=1).spec for stem in (f"{name}-int8", name))
+    assert (ours.name, ours.precision, theirs.precision) == (f"{name}-int8", "int8", "float32")
+    assert (ours.scale, ours.size_multiple, ours.state, ours.reach) == (theirs.scale, theirs.size_multiple, theirs.state, theirs.reach)
+    assert ours.card == {**theirs.card, "quantized_from": theirs.sha256, "calibration": ["clip.mkv (6 frames)"]}
+
+
+def test_a_split_head_is_the_merged_one(folder: Path, tmp_path: Path) -> None:
+    model = onnx.load(folder / "merged.onnx")
+    split_merged_head(model.graph, OnnxUpscaler(folder / "merged.onnx", threads=1).spec)
+    onnx.save(model, tmp_path / "split.onnx")
+    frames = list(hard_cases.noise(48, 32, 4))
+    error = codes(tmp_path / "split.onnx", frames) - codes(folder / "merged.onnx", frames)
+    assert np.abs(error).max() <= 1 and np.count_nonzero(error) < 1e-3 * error.size
+    apart = onnx.load(folder / "recurrent.onnx")
+    split_merged_head(apart.graph, OnnxUpscaler(folder / "recurrent.onnx", threads=1).spec)
+    assert apart == onnx.load(folder / "recurrent.onnx")
+
+
+def test_any_size_and_a_lost_state_go_through_it(folder: Path) -> None:
+    for size in ((2, 2), (6, 34), (35, 17)):
+        frames = list(hard_cases.noise(size[1], size[0], 2))
+        assert all((p.height, p.width) == (2 * size[0], 2 * size[1]) for p in played(folder / "merged-int8.onnx", frames, "cpu"))
+    upscaler = OnnxUpscaler(folder / "recurrent-int8.onnx", threads=1)
+    state = upscaler.initial_state(48, 64)
+    state.tensors()[1][0, 3, 2, 1] = np.nan
+    _, state = upscaler.step(picture(0, 48, 64), state)
+    assert state.restarted
+
+
+def test_what_cannot_be_quantized_is_refused(folder: Path, tmp_path: Path) -> None:
+    export_baseline("bicubic", 2, tmp_path / "bicubic.onnx")
+    (tmp_path / "broken.h264").write_bytes(bytes(range(256)) * 40)
+    for model, clip, error, sentence in (
+        (tmp_path / "bicubic.onnx", folder / "clip.mkv", ModelError, "no layer that is quantized"),
+        (folder / "merged-int8.onnx", folder / "clip.mkv", ModelError, "is int8 already"),
+        (folder / "merged.onnx", tmp_path / "broken.h264", InputError, "broken.h264"),
+    ):
+        with pytest.raises(error, match=sentence):
+            quantize(model, tmp_path / "out.onnx", [clip], name="out", frames=2)
+    assert not (tmp_path / "out.onnx").exists() and not list(tmp_path.glob("*.partial"))
+
+
+def test_from_a_checkpoint_to_a_verified_int8_artifact(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    footage = write_footage(tmp_path)
+    tiny = ["--steps", "2", "--batch", "1", "--patch", "16", "--frames", "2", "--window", "2", "--degradations", "area"]
+    assert train_main([str(footage), str(tmp_path / "run"), "--cache", str(tmp_path / "cache"), "--preset", "live", *tiny]) == 0
+    assert export_main([str(tmp_path / "run" / "checkpoint.pt"), "tiny", "--folder", str(tmp_path)]) == 0
+    model, clip, into = str(tmp_path / "tiny_x2.onnx"), str(tmp_path / "clip.mkv"), ["--folder", str(tmp_path)]
+    assert main([model, "tiny-int8", clip, clip, "--frames", "20", *into]) == 0
+    page = (tmp_path / "tiny-int8_x2.md").read_text()
+    sha256 = OnnxUpscaler(Path(model), threads=1).spec.sha256
+    assert (
+        f"- Quantized from the float32 artifact {sha256} (SHA-256) on clip.mkv (12 frames), clip.mkv (12 frames)" in page
+    )  # all there are
+    assert "in training), int8; " in page and "before it was quantized" in page
+
+    quantized = str(tmp_path / "tiny-int8_x2.onnx")
+    check = [quantized, clip, "--steps", "4", "--crop", "48x32"]
+    assert verify_main([*check, "--weights", model, "--provider", "cpu", "openvino"]) == 0
+    assert verify_main([quantized, "--weights", model, "--hard", "short", "--crop", "32x24", "--cases", "noise", "sizes"]) == 0
+    capsys.readouterr()
+    assert verify_main(check) == 1
+    assert "with --weights" in capsys.readouterr().err
+    assert verify_main([*check, "--weights", quantized]) == 1
+    assert "was not made from" in capsys.readouterr().err
+    assert main([model, "tiny-int8", clip, "--frames", "0", *into]) == 1
+    assert main([quantized, "twice", clip, *into]) == 1
+    assert capsys.readouterr().err.endswith("is int8 already: quantize the float32 artifact\n")
