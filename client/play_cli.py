@@ -31,7 +31,7 @@ from client.tiers import TieredUpscaler
 from client.video import MAX_SIDE
 
 PROGRAM = "gamesr-play"
-TIERS = "gamesr,live,bicubic"
+TIERS = "quality,balanced,live,bicubic"
 MIN_QUIET_S, MAX_QUIET_S = 1.0, 60.0
 EXAMPLES = """\
 examples:

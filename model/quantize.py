@@ -27,8 +27,10 @@ from client.video import read_frames
 
 # Not the gates, whose error the state would keep; not what interpolates, which makes the code values themselves; and not a head
 # whose base is apart: a residual of rare large values in 8 bits is what lost most, and such a head is a twentieth of the work.
-QUANTIZED = re.compile(r"network\.(stem|blocks\.\d+\.conv|head\.features)\.weight")
+QUANTIZED = re.compile(r"network\.(stem|blocks\.\d+\.(conv|0)|head\.features)\.weight")
 CALIBRATION_FRAMES = 8
+
+JOINING = ("Relu", "LeakyRelu", "Add")
 
 
 def quantize(artifact: Path, path: Path, clips: Sequence[Path], *, name: str, frames: int = CALIBRATION_FRAMES) -> dict[str, Any]:
@@ -57,7 +59,7 @@ def quantize(artifact: Path, path: Path, clips: Sequence[Path], *, name: str, fr
                 model,
                 whole,
                 footage,
-                op_types_to_quantize=["Conv", "Relu", "Add"],
+                op_types_to_quantize=["Conv", *JOINING],
                 nodes_to_quantize=nodes,
                 per_channel=True,
                 activation_type=QuantType.QUInt8,
@@ -117,7 +119,7 @@ def _quantized_nodes(graph: onnx.GraphProto) -> list[str]:
     eight_bits: set[str] = set()
     for node in graph.node:
         if (node.op_type == "Conv" and QUANTIZED.fullmatch(node.input[1])) or (
-            node.op_type in ("Relu", "Add") and eight_bits.issuperset(node.input)
+            node.op_type in JOINING and eight_bits.issuperset(node.input)
         ):
             nodes.append(node.name)
             eight_bits.update(node.output)

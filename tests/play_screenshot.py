@@ -1,52 +1,56 @@
-"""A picture of the player's window: `python -m tests.play_screenshot OUT.png`, on a screen that nobody looks at (xvfb)."""
+"""A picture of a stream that is being played, overlay and wipe on: `python -m tests.play_screenshot OUT.png [OPTION of gamesr-play]...`.
+
+gamesr-stream sends the clip that ships here, gamesr-play shows it on a screen that nobody looks at (xvfb).
+"""
 
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
-from itertools import islice
+import threading
+import time
+from ctypes import byref
 from pathlib import Path
 
 from PIL import Image
 
-from client.baselines import Baselines
-from client.models import DEFAULT_MODEL, find_model
-from client.pipeline import upscale_stream
-from client.sink import NullSink
-from client.timing import stage_latencies
-from client.upscaler import OnnxUpscaler
-from client.video import VideoSource
-from client.window import Window
-from tests.headless import headless_screen
+from client.play_cli import main as play
+from tests.headless import Screen, headless_screen
 from tests.serving import ROOT
 
 CLIP = ROOT / "tests/footage/oa_koth1_540p.mp4"
-FRAMES = 8  # the network has a memory by then
+ADDRESS = "127.0.0.1:5104"
+BEFORE_S, SECONDS = 6.0, 14  # the models are ready by then; the overlay has figures by the end
+STREAM = f"import sys; from client.stream_cli import main; sys.exit(main(['{CLIP}', '--to', '{ADDRESS}', '--copy', '--loop']))"
+
+
+def take(screen: Screen, path: Path) -> None:
+    """Press F1 and W, wait, and keep what the screen shows."""
+    import sdl2
+
+    time.sleep(BEFORE_S)
+    for key in (sdl2.SDLK_F1, sdl2.SDLK_w):
+        event = sdl2.SDL_Event()
+        event.type, event.key.keysym.sym = sdl2.SDL_KEYDOWN, key
+        sdl2.SDL_PushEvent(byref(event))
+    time.sleep(SECONDS - BEFORE_S - 2)
+    Image.fromarray(screen.picture()).save(path, optimize=True)
 
 
 def main() -> None:
-    path = Path(sys.argv[1])
+    path, options = Path(sys.argv[1]), sys.argv[2:]
     with headless_screen(1920, 1080) as screen:
         os.environ["DISPLAY"] = screen.display
-        with Window("GameSR") as window:
-            play(window)
-            Image.fromarray(screen.picture()).save(path, optimize=True)
+        sender = subprocess.Popen([sys.executable, "-c", STREAM], cwd=ROOT, stdout=subprocess.DEVNULL)
+        try:
+            threading.Thread(target=take, args=(screen, path), daemon=True).start()
+            status = play([ADDRESS, "--seconds", str(SECONDS), *options])
+        finally:
+            sender.terminate()
+            sender.wait()
     print(path, path.stat().st_size)
-
-
-def play(window: Window) -> None:
-    """Bicubic left of the wipe, ours right of it, and how long it took."""
-    upscaler = OnnxUpscaler(find_model(DEFAULT_MODEL, 2), provider="cpu", threads=1)
-    baselines = Baselines(("bicubic",), 2, provider="cpu", threads=1)
-    stamps = []
-    with VideoSource(CLIP) as source:
-        upscaler.warm_up(source.height, source.width)
-        for done in islice(upscale_stream(source, upscaler, NullSink()), FRAMES):
-            stamps.append(done.stamps)
-            latencies = stage_latencies(stamps)
-            overlay = [f"{stage:8s}p50 {latencies[stage].p50 / 1000:6.1f} ms" for stage in ("decode", "upscale")]
-            window.present(done.picture, left=baselines.upscale(done.decoded)["bicubic"], overlay=["bicubic | GameSR", *overlay])
-            window.actions()
+    sys.exit(status)
 
 
 if __name__ == "__main__":

@@ -263,12 +263,12 @@ def test_nothing_shown_is_said(tiers: TieredUpscaler) -> None:
         playing.summary(playing.play(), {})
 
 
-def test_damage_begins_the_memory_anew_without_new_buffers(tiers: TieredUpscaler) -> None:
+def test_the_end_of_damage_begins_the_memory_anew_without_new_buffers(tiers: TieredUpscaler) -> None:
     frames = [replace(frame, damaged=3 <= t < 5) for t, frame in enumerate(moving(8))]
     playing, _ = player(Script(frames), tiers, NullSink())
     before = {id(state._buffers) for state in tiers._states.values()}
     playing.play()
-    assert playing.tally.restarts == {"damage": 2} and playing.tally.damaged == 2
+    assert playing.tally.restarts == {"damage": 1} and playing.tally.damaged == 2
     assert {id(state._buffers) for state in tiers._states.values()} == before
 
 

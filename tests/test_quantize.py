@@ -84,7 +84,7 @@ def test_weights_are_symmetric_per_channel_and_what_must_stay_float_does(folder:
         assert tensors[source[conv.input[0]].input[2]].dtype == np.uint8
         int8_weights.add(source[conv.input[1]].input[0].removeprefix("network.").removesuffix(".weight_quantized"))
     if name == "merged":
-        assert int8_weights == {"stem", "blocks.0.conv", "blocks.1.conv", "head.features"} and float_weights == {"head.cells"}
+        assert int8_weights == {"stem", "blocks.0.0", "blocks.1.0", "head.features"} and float_weights == {"head.cells"}
     else:
         assert int8_weights == {"stem", "blocks.0.conv"}
         assert float_weights == {"lstm.gates", "head", "luma_base", "chroma_base"}
