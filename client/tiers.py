@@ -49,6 +49,7 @@ class TieredUpscaler:
         self._states: dict[int, State] = {}
         self._running, self._stream = 0, 0
         self._preparation: _Preparation | None = None
+        self.computing = threading.Lock()  # one model at a time: what plays must not slow down what is being timed
         self._upscalers = self._load(2)  # what is missing or does not start is said at once
 
     def __enter__(self) -> Self:
@@ -124,7 +125,8 @@ class TieredUpscaler:
             raise ValueError("this state is of a stream that was begun anew since")
         if self.tier != self._running:
             self._begin_again()
-        picture, after = self._upscalers[self._running].step(frame, self._states[self._running])
+        with self.computing:
+            picture, after = self._upscalers[self._running].step(frame, self._states[self._running])
         self._states[self._running] = after
         return picture, TieredState(state.height, state.width, state.stream, after.restarted)
 
@@ -162,7 +164,7 @@ class _Preparation(threading.Thread):
             for tier in reversed(range(len(self.upscalers))):
                 if self.stop:
                     break
-                self.states[tier], self.costs_ns[tier] = _timed(self.upscalers[tier], *self.size)
+                self.states[tier], self.costs_ns[tier] = _timed(self.upscalers[tier], *self.size, self._tiers.computing)
                 self.usable.set()
         except GamesrError as error:
             self._error = error
@@ -172,13 +174,14 @@ class _Preparation(threading.Thread):
             raise self._error
 
 
-def _timed(upscaler: OnnxUpscaler, height: int, width: int) -> tuple[State, int]:
-    """The buffers that frames of this size are computed in, and the least time that one took: others may be playing meanwhile."""
+def _timed(upscaler: OnnxUpscaler, height: int, width: int, computing: threading.Lock) -> tuple[State, int]:
+    """The buffers that frames of this size are computed in, and the least time that one took; between two, others may compute."""
     grey = [np.full(shape, 128, np.uint8) for shape in plane_shapes(height, width)]
     frame, state = Frame(grey[0], grey[1], grey[2]), upscaler.initial_state(height, width)
     durations_ns = []
     for _ in range(2 + TIMED_FRAMES):  # both bindings have run before anything counts
-        begin_ns = time.perf_counter_ns()
-        _, state = upscaler.step(frame, state)
-        durations_ns.append(time.perf_counter_ns() - begin_ns)
+        with computing:
+            begin_ns = time.perf_counter_ns()
+            _, state = upscaler.step(frame, state)
+            durations_ns.append(time.perf_counter_ns() - begin_ns)
     return state, min(durations_ns[2:])

@@ -286,7 +286,7 @@ class GameSR(Network):
 
 
 def shuffle_channels_last(cells: Tensor, block: int) -> Tensor:
-    """PixelShuffle of one plane, (N, block^2, h, w) to (N, 1, block*h, block*w), by way of the layout that convolutions leave on processors.
+    """PixelShuffle of one plane, (N, block^2, h, w) to (N, 1, block*h, block*w), by way of the layout that convolutions leave.
 
     There it moves rows of `block` samples; OpenVINO's DepthToSpace takes twice as long.
     """

@@ -16,6 +16,7 @@ from pathlib import Path
 from PIL import Image
 
 from client.play_cli import main as play
+from client.rgb import RgbPicture
 from tests.headless import Screen, headless_screen
 from tests.serving import ROOT
 
@@ -25,7 +26,7 @@ BEFORE_S, SECONDS = 6.0, 14  # the models are ready by then; the overlay has fig
 STREAM = f"import sys; from client.stream_cli import main; sys.exit(main(['{CLIP}', '--to', '{ADDRESS}', '--copy', '--loop']))"
 
 
-def take(screen: Screen, path: Path) -> None:
+def take(screen: Screen, pictures: list[RgbPicture]) -> None:
     """Press F1 and W, wait, and keep what the screen shows."""
     import sdl2
 
@@ -35,20 +36,22 @@ def take(screen: Screen, path: Path) -> None:
         event.type, event.key.keysym.sym = sdl2.SDL_KEYDOWN, key
         sdl2.SDL_PushEvent(byref(event))
     time.sleep(SECONDS - BEFORE_S - 2)
-    Image.fromarray(screen.picture()).save(path, optimize=True)
+    pictures.append(screen.picture())
 
 
 def main() -> None:
     path, options = Path(sys.argv[1]), sys.argv[2:]
+    pictures: list[RgbPicture] = []
     with headless_screen(1920, 1080) as screen:
         os.environ["DISPLAY"] = screen.display
         sender = subprocess.Popen([sys.executable, "-c", STREAM], cwd=ROOT, stdout=subprocess.DEVNULL)
         try:
-            threading.Thread(target=take, args=(screen, path), daemon=True).start()
+            threading.Thread(target=take, args=(screen, pictures), daemon=True).start()
             status = play([ADDRESS, "--seconds", str(SECONDS), *options])
         finally:
             sender.terminate()
             sender.wait()
+    Image.fromarray(pictures[0]).save(path, optimize=True)
     print(path, path.stat().st_size)
     sys.exit(status)
 

@@ -227,10 +227,10 @@ def test_the_last_tier_shows_it_until_all_are_ready(model_file: ModelFile, monke
     gate = threading.Event()
     timed = client.tiers._timed
 
-    def slowly(upscaler: OnnxUpscaler, height: int, width: int) -> tuple[State, int]:
+    def slowly(upscaler: OnnxUpscaler, height: int, width: int, computing: threading.Lock) -> tuple[State, int]:
         if upscaler.spec.state:
             assert gate.wait(60)
-        return timed(upscaler, height, width)
+        return timed(upscaler, height, width, computing)
 
     monkeypatch.setattr("client.tiers._timed", slowly)
     files = [str(model_file("a.onnx")), str(model_file("c.onnx", stateful=False))]
@@ -255,6 +255,32 @@ def test_the_last_tier_shows_it_until_all_are_ready(model_file: ModelFile, monke
     plain = OnnxUpscaler(Path(files[1]), threads=1)
     for frame, shown in zip(moving(4), sink.pictures, strict=False):
         assert planes(plain.step(frame, plain.initial_state(32, 48))[0]) == planes(shown)
+
+
+def test_what_plays_does_not_slow_down_what_is_timed(model_file: ModelFile, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One model computes at a time, also while a thread makes the other tiers ready."""
+    at_work, most, step = 0, 0, OnnxUpscaler.step
+
+    def counting(self: OnnxUpscaler, frame: Frame, state: State) -> tuple[Frame, State]:
+        nonlocal at_work, most
+        at_work += 1
+        most = max(most, at_work)
+        time.sleep(0.002)
+        try:
+            return step(self, frame, state)
+        finally:
+            at_work -= 1
+
+    monkeypatch.setattr(OnnxUpscaler, "step", counting)
+    names = [str(model_file(f"tier{number}.onnx", stateful=True)) for number in range(3)]
+    with TieredUpscaler(names, display_height=None, provider="cpu", threads=1) as tiers:
+        while not tiers.ready(32, 48):
+            time.sleep(0.001)
+        assert not tiers.complete
+        frame, state = picture(0, 32, 48), tiers.initial_state(32, 48)
+        while not tiers.complete:
+            _, state = tiers.step(frame, state)
+    assert most == 1
 
 
 def test_nothing_shown_is_said(tiers: TieredUpscaler) -> None:
