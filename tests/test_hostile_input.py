@@ -142,7 +142,7 @@ def test_flipped_bits(saved: Run, make_clip: MakeClip, tmp_path: Path, seed: int
     record = saved(write(tmp_path / "flipped.h264", bytes(content)))
     assert FRAMES // 3 <= record["frames"] <= FRAMES
     assert record["frames"] + record["decode_errors"] >= FRAMES - 1
-    assert (record["state_resets"] > 0) == (record["damaged_frames"] > 0)
+    assert record["state_resets"] <= record["damaged_frames"]  # once where damage ends, if it does
 
 
 def packets_of(clip: Path) -> list[bytes]:
@@ -156,7 +156,7 @@ def test_a_packet_of_garbage(saved: Run, make_clip: MakeClip, tmp_path: Path) ->
     broken = write(tmp_path / "garbage.mkv", clip.read_bytes().replace(packet, NOISE[: len(packet)]))
     record = saved(broken)
     assert (record["frames"], record["decode_errors"]) == (FRAMES - 1, 1)
-    assert (record["damaged_frames"], record["state_resets"]) == (2, 2)
+    assert (record["damaged_frames"], record["state_resets"]) == (2, 1)  # where damage ends
 
 
 def test_missing_packets(saved: Run, make_clip: MakeClip, tmp_path: Path) -> None:

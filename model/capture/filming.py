@@ -24,6 +24,7 @@ from model.capture.games import Run, SceneSpec
 SOURCE = Path(__file__).parent / "frame_clock.c"
 WINDOW = (1920, 1080)  # for games that refuse a smaller one
 RECORDING = (256, 144)
+LAST_WORDS_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,8 @@ class _Stage:
     def last_words(self) -> str:
         if self.timed_out:
             return f"it took longer than {self.timeout_s:g} s (--timeout)"
+        with suppress(subprocess.TimeoutExpired):
+            self.process.wait(LAST_WORDS_S)  # it has closed the pipe, and may be about to say why
         lines = [line.strip() for line in self.log.read_text(errors="replace").splitlines()]
         return next((line for line in reversed(lines) if line), "it said nothing")[:200]
 
