@@ -69,7 +69,7 @@ def test_bfloat16_is_near_or_refused_where_the_processor_has_none(artifacts: dic
 
 
 def test_more_sizes_than_are_kept_and_streams_that_take_turns(artifacts: dict[str, Path]) -> None:
-    upscaler = OnnxUpscaler(artifacts["balanced"], provider="openvino", threads=1)
+    upscaler = OnnxUpscaler(artifacts["planes"], provider="openvino", threads=1)
     sizes = [(24 + 4 * n, 32) for n in range(MAX_COMPILED_SIZES + 2)]
     clips = [clip_of(3, *size) for size in sizes]
     states = [upscaler.initial_state(*size) for size in sizes]
@@ -79,7 +79,7 @@ def test_more_sizes_than_are_kept_and_streams_that_take_turns(artifacts: dict[st
             upscaled, states[stream] = upscaler.step(clip[step], states[stream])
             taken[stream].append(upscaled)
     for clip, found in zip(clips, taken, strict=True):
-        assert not difference(found, pictures(artifacts["balanced"], "openvino", clip)).any()
+        assert not difference(found, pictures(artifacts["planes"], "openvino", clip)).any()
 
 
 def test_a_lost_state_restarts_in_openvino_too(artifacts: dict[str, Path]) -> None:
