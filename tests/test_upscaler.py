@@ -20,6 +20,7 @@ from client.frames import ColourTags, Frame
 from client.models import find_model, shipped_models
 from client.upscaler import OnnxUpscaler, State
 from tests.conftest import tiny_model
+from tests.stepping import same
 
 ModelFile = Callable[..., Path]
 
@@ -29,10 +30,6 @@ def noise(seed: int, height: int = 10, width: int = 14) -> Frame:
     chroma = (-(-height // 2), -(-width // 2))
     y, u, v = (rng.integers(0, 256, shape, dtype=np.uint8) for shape in ((height, width), chroma, chroma))
     return Frame(y, u, v, seed, Fraction(1, 30))
-
-
-def same(a: Frame, b: Frame) -> bool:
-    return all(np.array_equal(p, q) for p, q in zip((a.y, a.u, a.v), (b.y, b.u, b.v), strict=True))
 
 
 def run(upscaler: OnnxUpscaler, frames: list[Frame], state: State | None = None) -> list[Frame]:
