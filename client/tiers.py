@@ -19,6 +19,7 @@ from client.models import find_model
 from client.upscaler import OnnxUpscaler, State, plane_shapes
 
 TIMED_FRAMES = 5
+_PAUSE_S = 0.001
 
 
 class TieredState:
@@ -79,12 +80,14 @@ class TieredUpscaler:
     def ready(self, height: int, width: int) -> bool:
         """Whether pictures of this size can be upscaled, with the last tier at least; the first question about a size begins that.
 
-        It runs in a thread, from the last tier to the first, so that decoding goes on. Raises what it raised.
+        It runs in a thread, from the last tier to the first, so that decoding goes on. Raises what it raised, and ModelError for anything
+        that is no GamesrError.
         """
-        if self.size == (height, width) and (self._preparation is None or self._preparation.size == self.size):
-            return True
-        if self._preparation is None or self._preparation.size != (height, width):
+        if self._preparation is not None and self._preparation.size != (height, width):
             self.close()  # one at a time: a stream cannot have more made by changing faster
+        if self.size == (height, width):
+            return True
+        if self._preparation is None:
             self._preparation = _Preparation(self, height, width)
             self._preparation.start()
         preparation = self._preparation
@@ -109,10 +112,12 @@ class TieredUpscaler:
             time.sleep(0.01)
 
     def close(self) -> None:
-        """Wait for the thread, which ends with the tier that it is at."""
+        """Wait for the thread, which ends with the frame that it is at; a size of which only some tiers are ready is begun anew."""
         if self._preparation is not None:
-            self._preparation.stop = True
+            self._preparation.stop.set()
             self._preparation.join()
+            if self._preparation.size == self.size:
+                self.size = None
             self._preparation = None
 
     def initial_state(self, height: int, width: int) -> TieredState:
@@ -148,13 +153,17 @@ class TieredUpscaler:
         return self._loaded[scale]
 
 
+class _Stopped(Exception):
+    """Another size is wanted by now."""
+
+
 class _Preparation(threading.Thread):
     """Makes each tier's buffers for a size, has it run and times it; the lists are filled as it goes."""
 
     def __init__(self, tiers: TieredUpscaler, height: int, width: int) -> None:
         super().__init__(name="tiers", daemon=True)
         self.size = height, width
-        self.stop = False
+        self.stop = threading.Event()
         self.usable = threading.Event()
         self.upscalers: list[OnnxUpscaler] = []
         self.states: dict[int, State] = {}
@@ -166,14 +175,18 @@ class _Preparation(threading.Thread):
         try:
             self.upscalers = list(self._tiers._load(self._tiers.scale(self.size[0])))
             for tier in reversed(range(len(self.upscalers))):
-                if self.stop:
-                    break
-                self.states[tier], self.costs_ns[tier] = _timed(self.upscalers[tier], *self.size, self._tiers.computing)
+                self.states[tier], self.costs_ns[tier] = self._timed(self.upscalers[tier])
                 if not self.usable.is_set() and tier:
                     self._leave_a_core(tier)
                 self.usable.set()
+        except _Stopped:
+            pass
         except GamesrError as error:
             self._error = error
+        except Exception as error:  # the stream waits for this thread: whatever ends it is said there
+            height, width = self.size
+            self._error = ModelError(f"the models could not be made ready for {width}x{height}: {str(error) or type(error).__name__}")
+            self._error.__cause__ = error
 
     def _leave_a_core(self, tier: int) -> None:
         """Take the last tier on one thread less, where that leaves time for decoding a frame too."""
@@ -181,23 +194,28 @@ class _Preparation(threading.Thread):
         if full.threads == 1:
             return
         less = OnnxUpscaler(find_model(self._tiers.names[tier], full.spec.scale), provider=full.provider, threads=full.threads - 1)
-        state, cost_ns = _timed(less, *self.size, self._tiers.computing)
+        state, cost_ns = self._timed(less)
         if cost_ns <= START_SHARE * DEFAULT_PERIOD_NS:
             self.upscalers[tier], self.states[tier], self.costs_ns[tier] = less, state, cost_ns
+
+    def _timed(self, upscaler: OnnxUpscaler) -> tuple[State, int]:
+        """The buffers that frames are computed in, and the least time that one took; raises _Stopped.
+
+        After each the lock is left alone for a moment: who waits for it wakes up more slowly than this thread takes it again.
+        """
+        state = upscaler.initial_state(*self.size)
+        grey = [np.full(shape, 128, np.uint8) for shape in plane_shapes(*self.size)]
+        frame = Frame(grey[0], grey[1], grey[2])
+        durations_ns = []
+        for _ in range(2 + TIMED_FRAMES):  # both bindings have run before anything counts
+            if self.stop.wait(_PAUSE_S):
+                raise _Stopped
+            with self._tiers.computing:
+                begin_ns = time.perf_counter_ns()
+                _, state = upscaler.step(frame, state)
+                durations_ns.append(time.perf_counter_ns() - begin_ns)
+        return state, min(durations_ns[2:])
 
     def check(self) -> None:
         if self._error is not None:
             raise self._error
-
-
-def _timed(upscaler: OnnxUpscaler, height: int, width: int, computing: threading.Lock) -> tuple[State, int]:
-    """The buffers that frames of this size are computed in, and the least time that one took; between two, others may compute."""
-    grey = [np.full(shape, 128, np.uint8) for shape in plane_shapes(height, width)]
-    frame, state = Frame(grey[0], grey[1], grey[2]), upscaler.initial_state(height, width)
-    durations_ns = []
-    for _ in range(2 + TIMED_FRAMES):  # both bindings have run before anything counts
-        with computing:
-            begin_ns = time.perf_counter_ns()
-            _, state = upscaler.step(frame, state)
-            durations_ns.append(time.perf_counter_ns() - begin_ns)
-    return state, min(durations_ns[2:])
