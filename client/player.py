@@ -105,8 +105,7 @@ class Player:
         for item in self._source.frames(self._idle):
             frame, tally = item.frame, self.tally
             self.period.add(frame)
-            if not self._tiers.ready(frame.height, frame.width):
-                tally.unready += 1
+            if not self._ready(frame):
                 self._idle()
                 continue
             now_ns, waiting = time.perf_counter_ns(), self._source.waiting()
@@ -124,6 +123,17 @@ class Player:
             self._item = item
             self._decoded(frame)
             yield item
+
+    def _ready(self, frame: Frame) -> bool:
+        """Whether it can be upscaled: not while the tiers are made ready for its size, and never where that would be too large."""
+        try:
+            if self._tiers.ready(frame.height, frame.width):
+                return True
+        except InputError as error:
+            self._tell("refused", f"not shown: {error}")
+            return False
+        self.tally.unready += 1
+        return False
 
     def _leaves_out(self, now_ns: int, age_ns: int, waiting: int) -> bool:
         governor = self.governor

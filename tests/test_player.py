@@ -197,6 +197,23 @@ def test_a_size_that_goes_and_comes_back_in_warm_up(tiers: TieredUpscaler, monke
     assert playing.governor is not None and playing.governor.tier == tiers.tier and all(tiers.costs_ns)
 
 
+def test_what_is_too_large_is_not_shown_and_ends_nothing(tiers: TieredUpscaler) -> None:
+    huge = Frame(np.broadcast_to(np.uint8(9), (8192, 8192)), *[np.broadcast_to(np.uint8(9), (4096, 4096))] * 2)
+    sink = Kept()
+
+    class Slowly(Script):
+        def frames(self, idle: Idle) -> Iterator[Arrived]:
+            for item in super().frames(idle):
+                yield item
+                while tiers._preparation is not None and tiers._preparation.is_alive():
+                    time.sleep(0.001)
+
+    playing, told = player(Slowly(moving(3) + [huge] * 3 + moving(3)), tiers, sink)
+    assert playing.play() == "the stream ended"
+    assert len(sink.pictures) == 6 and playing.tally.shown == 6 and playing.tally.unready <= 1
+    assert told.kinds().count("refused") >= 2 and "8192x8192" in dict(told.said)["refused"]
+
+
 def test_nothing_shown_is_said(tiers: TieredUpscaler) -> None:
     playing, _ = player(Script([]), tiers, NullSink())
     with pytest.raises(InputError, match="no picture of script could be shown"):
