@@ -36,7 +36,7 @@ class PlayTally:
 
     `late` are shown frames that missed their deadline, `left_out` those that were not shown so that newer ones were in time,
     `unready` those that came while the tiers were made ready: the last tier showed them, if any did; nothing else counts them.
-    A freeze is a gap of more than three periods between two shown frames.
+    A freeze is a gap of more than three periods between two pictures, whoever showed them, from the first shown frame on.
     """
 
     shown: int = 0
@@ -52,7 +52,7 @@ class PlayTally:
     switches: deque[Switch] = field(default_factory=lambda: deque(maxlen=_KEPT_SWITCHES))
     sizes: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=_KEPT_SWITCHES))  # (width, height)
     first_ns: int = 0  # when the first was shown
-    last_ns: int = 0
+    last_ns: int = 0  # when the last picture was, whoever showed it
     _stamps: NDArray[np.int64] = field(default_factory=lambda: np.full((KEPT_FRAMES, 8), -1, np.int64), repr=False)  # touched: it is there
 
     def add(self, item: Arrived, done: FrameDone, *, tier: str, deadline_ns: int, period_ns: int) -> None:
@@ -68,19 +68,27 @@ class PlayTally:
             now_ns,
             -1 if item.sent_ns is None else item.sent_ns,
         )
-        if self.shown:
-            gap_ns = now_ns - self.last_ns
-            self.freezes += gap_ns > FREEZE_PERIODS * period_ns
-            self.longest_gap_ns = max(self.longest_gap_ns, gap_ns)
-        else:
+        if not self.shown:
             self.first_ns = now_ns
-        self.last_ns = now_ns
+        self._gap(now_ns, period_ns)
         self.shown += 1
         self.late += now_ns - item.last_ns > deadline_ns
         self.damaged += done.decoded.damaged
         self.tier_frames[tier] += 1
         if done.restart is not None:
             self.restarts[done.restart.name.lower()] += 1
+
+    def add_unready(self, now_ns: int, *, period_ns: int) -> None:
+        """The last tier showed a frame while the others were made ready."""
+        self.unready += 1
+        self._gap(now_ns, period_ns)
+
+    def _gap(self, now_ns: int, period_ns: int) -> None:
+        if self.shown:
+            gap_ns = now_ns - self.last_ns
+            self.freezes += gap_ns > FREEZE_PERIODS * period_ns
+            self.longest_gap_ns = max(self.longest_gap_ns, gap_ns)
+        self.last_ns = now_ns
 
     def switch(self, switch: Switch) -> None:
         self.switched += 1

@@ -170,7 +170,7 @@ class Player:
             self._why = _READY
         self._shown_tier = self._tiers.tier
         if governor is None:
-            self.tally.unready += 1
+            self.tally.add_unready(stamps.written_ns, period_ns=self.period.ns)
             return
         self.tally.add(item, done, tier=self._tiers.names[self._tiers.tier], deadline_ns=governor.deadline_ns, period_ns=self.period.ns)
         self._follow(

@@ -17,7 +17,7 @@ import pytest
 from client.errors import InputError
 from client.frames import Frame
 from client.play_source import Arrived, Idle
-from client.play_tally import PlayTally
+from client.play_tally import FREEZE_PERIODS, PlayTally
 from client.player import Player
 from client.sink import NullSink
 from client.tiers import TieredUpscaler, _Preparation
@@ -212,6 +212,38 @@ def test_what_is_too_large_is_not_shown_and_ends_nothing(tiers: TieredUpscaler) 
     assert playing.play() == "the stream ended"
     assert len(sink.pictures) == 6 and playing.tally.shown == 6 and playing.tally.unready <= 1
     assert told.kinds().count("refused") >= 2 and "8192x8192" in dict(told.said)["refused"]
+
+
+def test_what_the_last_tier_shows_is_no_freeze(tiers: TieredUpscaler, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a change of size only the last tier is ready for longer than a freeze takes, and the picture moves all the time."""
+    gate, timed = threading.Event(), _Preparation._timed
+
+    def slowly(self: _Preparation, upscaler: OnnxUpscaler) -> tuple[State, int]:
+        assert not upscaler.spec.state or gate.wait(60)
+        return timed(self, upscaler)
+
+    class Paced(Script):
+        fps = 5
+
+        def frames(self, idle: Idle) -> Iterator[Arrived]:
+            for item in super().frames(idle):
+                if item.frame.pts == 3:
+                    while not tiers.ready(64, 96):
+                        time.sleep(0.001)
+                if item.frame.pts == 19:
+                    gate.set()
+                    tiers.prepare(64, 96)
+                time.sleep(0.05)
+                yield item
+
+    monkeypatch.setattr(_Preparation, "_timed", slowly)
+    playing, _ = player(Paced(moving(3) + moving(18, 64, 96)), tiers, NullSink())
+    playing.play()
+    tally = playing.tally
+    assert (tally.unready, tally.shown, tally.freezes) == (16, 5, 0)
+    assert tally.last_ns - tally.first_ns > FREEZE_PERIODS * playing.period.ns > tally.longest_gap_ns
+    tally.add_unready(tally.last_ns + 2 * FREEZE_PERIODS * playing.period.ns, period_ns=playing.period.ns)
+    assert tally.freezes == 1  # whoever shows it
 
 
 def test_nothing_shown_is_said(tiers: TieredUpscaler) -> None:
