@@ -147,7 +147,7 @@ class Player:
         """A picture of another size, or the first: the last tier shows it until all are ready."""
         tiers, before = self._tiers, self._size
         self._size, self.governor = (frame.width, frame.height), None
-        self.tally.sizes.append(self._size)
+        self.tally.resize(self._size)
         if before is not None:
             self._why = "the picture changed size"
             self._tell("size", f"the picture is now {frame.width}x{frame.height}, it was {before[0]}x{before[1]}")
