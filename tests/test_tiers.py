@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import threading
 import time
 from collections.abc import Callable
@@ -42,15 +41,14 @@ def test_a_switch_begins_with_an_empty_memory(tiers: TieredUpscaler, before: int
     assert [planes(shown) for shown in pictures] == [planes(alone) for alone in own]
 
 
-@pytest.mark.parametrize(("before", "after"), list(itertools.permutations(range(3), 2)))
+@pytest.mark.parametrize(("before", "after"), [(0, 1), (1, 0), (2, 0), (2, 1)])
 def test_a_switch_is_no_flash(before: int, after: int) -> None:
-    """Over a switch a picture that stands still moves by what the two models' pictures of it differ, and hardly more.
+    """Over a switch a picture that stands still moves by what the two models' settled pictures of it differ.
 
-    Before, the second one played another scene, of which nothing is to be seen.
+    The second one remembered noise when it was left: shown with that it would move by up to half as much again.
     """
-    draw = np.random.default_rng(1)
-    still = replace(picture(3, 48, 64), y=draw.integers(0, 256, (48, 64), np.uint8))
-    other = replace(still, y=255 - still.y)
+    still = picture(3, 48, 64)
+    other = replace(still, y=np.random.default_rng(1).integers(0, 256, (48, 64), np.uint8))
     with TieredUpscaler(["gamesr", "gamesr-paper", "bicubic"], display_height=None, provider="cpu", threads=1) as tiers:
         tiers.prepare(48, 64)
         state, pictures = tiers.initial_state(48, 64), []
@@ -60,7 +58,7 @@ def test_a_switch_is_no_flash(before: int, after: int) -> None:
                 shown, state = tiers.step(frame, state)
                 pictures.append(shown.y.astype(float))
     settled, first, settles = pictures[13], pictures[14], pictures[23]
-    assert np.std(first - settled) <= 1.1 * np.std(settles - settled)
+    assert np.linalg.norm(first - settled) <= 1.05 * np.linalg.norm(settles - settled)
 
 
 def test_a_tier_that_comes_back_remembers_nothing(tiers: TieredUpscaler) -> None:
@@ -164,6 +162,7 @@ def test_what_plays_goes_on_while_others_are_timed(tiers: TieredUpscaler, steps:
     steps.clear()
     while not tiers.complete:
         _, state = tiers.step(frame, state)
+        time.sleep(0.005)  # until the next one comes
     timed = steps.count("tiers")
     assert len(steps) - timed >= timed // 2 >= client.tiers.TIMED_FRAMES - 2
 
