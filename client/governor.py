@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 START_SHARE = 0.8  # of the limit: what a tier may cost to be begun with, since decoding and presenting take their part
-FIT_SHARE = 0.9  # of the deadline: what a better tier may come to, as far as can be told beforehand
+FIT_SHARE = 0.9  # of the limit: what a better tier may come to, as far as can be told beforehand
 SPREAD = 1.1  # a frame's p95 over its median, on a machine that does nothing else
 WINDOW_FRAMES = 60
 MIN_FRAMES = 20  # fewer have no 95th percentile
@@ -36,22 +36,17 @@ class Governor:
 
     Down it goes to the best tier that should fit, or to the last: when three frames in a row missed, when three wait, when the p95
     of the last 60 is over the deadline, or when six of the last 600 missed. Up it goes when none of 60 missed and the better tier should
-    fit: its warm-up cost, times how much slower than in its own warm-up the present tier runs, and what the frame takes besides, come to
-    at most 0.9 of the deadline in the 95th percentile and to a frame's period in the median, since a queue makes good for one frame what
-    another took. From any switch to one upwards pass 2 s; a tier that does not last 10 s is next tried after twice as long as before, at
-    most after 64 s.
-
-    `crowded`, to be set at any time, says that others compute on cores that a better tier would want, which times of a tier that leaves
-    them a core do not show. Then a tier is tried only 64 s after it was left, and that it fails is not held against it.
+    come to at most 0.9 of the limit: its warm-up cost, times how much slower than in its own warm-up the present tier runs, and what
+    the frame takes besides. From any switch to one upwards pass 2 s; a tier that does not last 10 s is next tried after twice as long
+    as before, at most after 64 s.
     """
 
     def __init__(self, costs_ns: Sequence[int], *, deadline_ns: int, period_ns: int, now_ns: int) -> None:
         self.deadline_ns, self.period_ns = deadline_ns, period_ns
-        self.crowded = False
         self._costs_ns = costs_ns
         self._in_a_row = 0
         self._hold_ns = [HOLD_NS] * len(costs_ns)
-        self._left_ns = [now_ns] * len(costs_ns)
+        self._not_before_ns = [now_ns + HOLD_NS] * len(costs_ns)
         fitting = [tier for tier, cost_ns in enumerate(costs_ns) if cost_ns <= START_SHARE * min(deadline_ns, period_ns)]
         self.tier = fitting[0] if fitting else len(costs_ns) - 1
         self._begin(now_ns)
@@ -93,11 +88,11 @@ class Governor:
     def _down(self, now_ns: int, reason: str) -> Switch | None:
         if self.tier == len(self._costs_ns) - 1:
             return None
-        if now_ns - self._since_ns >= LASTS_NS:
-            self._hold_ns[self.tier] = HOLD_NS
-        elif not self._begun_crowded:
+        if now_ns - self._since_ns < LASTS_NS:
             self._hold_ns[self.tier] = min(2 * self._hold_ns[self.tier], MAX_HOLD_NS)
-        self._left_ns[self.tier] = now_ns
+        else:
+            self._hold_ns[self.tier] = HOLD_NS
+        self._not_before_ns[self.tier] = now_ns + self._hold_ns[self.tier]
         below = range(self.tier + 1, len(self._costs_ns))
         fitting = [tier for tier in below if self._fits(tier, 1.0)] if self._upscale_ns else [self.tier + 1]
         return self._switch(now_ns, fitting[0] if fitting else below[-1], reason)
@@ -108,18 +103,17 @@ class Governor:
         if any(latency_ns > self.deadline_ns for latency_ns in self._latencies_ns):
             return None
         for tier in range(self.tier):
-            hold_ns = MAX_HOLD_NS if self.crowded else self._hold_ns[tier]
-            if now_ns - self._left_ns[tier] >= hold_ns and self._fits(tier, FIT_SHARE):
+            if now_ns >= self._not_before_ns[tier] and self._fits(tier, FIT_SHARE):
                 return self._switch(now_ns, tier, "the better tier fits the measured load")
         return None
 
     def _fits(self, tier: int, share: float) -> bool:
         """Whether frames should be in time with a tier, as slow as the machine is now."""
         slower = _median(self._upscale_ns) / max(1, self._costs_ns[self.tier])
-        cost_ns = self._costs_ns[tier] * slower
-        late_ns = SPREAD * cost_ns + _p95([before_ns for before_ns, _ in self._besides_ns])
-        busy_ns = cost_ns + _median([busy_ns for _, busy_ns in self._besides_ns])
-        return late_ns <= share * self.deadline_ns and busy_ns <= self.period_ns
+        cost_ns = self._costs_ns[tier] * slower * SPREAD
+        late_ns = cost_ns + _p95([before_ns for before_ns, _ in self._besides_ns])
+        busy_ns = cost_ns + _p95([busy_ns for _, busy_ns in self._besides_ns])
+        return late_ns <= share * self.deadline_ns and busy_ns <= share * self.period_ns
 
     def _switch(self, now_ns: int, tier: int, reason: str) -> Switch:
         switch = Switch(now_ns, self.tier, tier, reason)
@@ -128,7 +122,7 @@ class Governor:
         return switch
 
     def _begin(self, now_ns: int) -> None:
-        self._since_ns, self._begun_crowded = now_ns, self.crowded
+        self._since_ns = now_ns
         self._in_a_row = 0
         self._latencies_ns: deque[int] = deque(maxlen=WINDOW_FRAMES)
         self._upscale_ns: deque[int] = deque(maxlen=WINDOW_FRAMES)

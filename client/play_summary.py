@@ -21,7 +21,7 @@ _POSTED_FPS = (30, 60, 120)
 
 @dataclass(frozen=True)
 class PlaySummary:
-    """Everything known after playing; at least one frame was shown. `specs`, `costs_ns` and `threads` are of the tiers, the best first."""
+    """Everything known after playing; at least one frame was shown. `specs` and `costs_ns` are of the tiers, the best first."""
 
     source: str
     ended: str
@@ -29,7 +29,7 @@ class PlaySummary:
     specs: Mapping[str, ModelSpec]
     costs_ns: Sequence[int]
     provider: str
-    threads: Sequence[int]
+    threads: int
     deadline_ns: int
     period_ns: int
     reception: ReceptionCounts | None
@@ -46,6 +46,7 @@ class PlaySummary:
             "sizes": [list(size) for size in tally.sizes],
             "scale": self._spec.scale,
             "provider": self.provider,
+            "threads": self.threads,
             "deadline_ms": self.deadline_ns / 1e6,
             "period_ms": self.period_ns / 1e6,
             "seconds": self._seconds,
@@ -61,8 +62,8 @@ class PlaySummary:
             "longest_gap_ms": tally.longest_gap_ns / 1e6,
             "state_restarts": dict(tally.restarts),
             "tiers": [
-                {"name": name, "sha256": spec.sha256, "threads": threads, "warm_up_ms": cost_ns / 1e6, "frames": tally.tier_frames[name]}
-                for (name, spec), threads, cost_ns in zip(self.specs.items(), self.threads, self.costs_ns, strict=True)
+                {"name": name, "sha256": spec.sha256, "warm_up_ms": cost_ns / 1e6, "frames": tally.tier_frames[name]}
+                for (name, spec), cost_ns in zip(self.specs.items(), self.costs_ns, strict=True)
             ],
             "switched": tally.switched,
             "switches": [
@@ -93,7 +94,7 @@ class PlaySummary:
             f"  deadline {self.deadline_ns / 1e6:.1f} ms: {100 * self._kept:.2f}% kept; {tally.late} late, {tally.left_out} left out"
             f"{f', {tally.unready} came before all tiers were ready' if tally.unready else ''}",
             f"  freezes  {tally.freezes}, the longest gap {tally.longest_gap_ns / 1e6:.0f} ms",
-            f"  tiers    {tiers} on {self.provider}, threads {', '.join(map(str, self.threads))}; {tally.switched} switches",
+            f"  tiers    {tiers} on {self.provider}, threads {self.threads}; {tally.switched} switches",
         ]
         for switch in list(tally.switches)[-5:]:
             names = f"{self._names[switch.before]} -> {self._names[switch.after]}"
@@ -138,7 +139,7 @@ class PlaySummary:
             "model_sha256": spec.sha256,
             "precision": spec.precision,
             "provider": self.provider,
-            "threads": self.threads[self._names.index(name)],
+            "threads": self.threads,
             "machine": machine or "unknown",
             "low_width": width,
             "low_height": height,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 
-from client.cores import Crowding
 from client.deadline import DeadlineRule, FramePeriod
 from client.errors import InputError
 from client.frames import Frame
@@ -51,7 +50,6 @@ class Player:
         self._deadline_ns, self._frames = deadline_ns, frames
         self._end_ns = None if seconds is None else time.perf_counter_ns() + int(seconds * 1e9)
         self._rule = DeadlineRule()
-        self._crowding = Crowding(tiers.threads[0])
         self._size: tuple[int, int] | None = None
         self._item: Arrived | None = None
         self._shown_tier: int | None = None
@@ -113,7 +111,7 @@ class Player:
                 self._resize(frame)
             if self.governor is None and self._tiers.complete:
                 self._begin(now_ns)
-            if self._leaves_out(now_ns, now_ns - item.last_ns, waiting):
+            if self._leaves_out(now_ns - item.last_ns, waiting):
                 if self.governor is None:
                     tally.unready += 1
                 else:
@@ -135,12 +133,11 @@ class Player:
         self.tally.unready += 1
         return False
 
-    def _leaves_out(self, now_ns: int, age_ns: int, waiting: int) -> bool:
+    def _leaves_out(self, age_ns: int, waiting: int) -> bool:
         governor = self.governor
         frame_ns = self._tiers.costs_ns[-1] if governor is None else governor.frame_ns
         if governor is not None:
             governor.deadline_ns, governor.period_ns = self.deadline_ns, self.period.ns
-            governor.crowded = self._crowding.at(now_ns)
         return self._rule.leaves_out(age_ns=age_ns, waiting=waiting, frame_ns=frame_ns, deadline_ns=self.deadline_ns)
 
     def _resize(self, frame: Frame) -> None:

@@ -129,7 +129,6 @@ class OpenVinoRuntime:
             "INFERENCE_NUM_THREADS": threads,
             "NUM_STREAMS": 1,
             "PERF_COUNT": counting,
-            "ENABLE_CPU_PINNING": False,  # a thread bound to a core waits for whoever else is there, while another core is idle
         }
         self._compiled: dict[tuple[tuple[str, tuple[int, ...]], ...], Any] = {}
 

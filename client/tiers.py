@@ -11,10 +11,8 @@ from typing import Self
 import numpy as np
 
 from client.artifact import ModelSpec
-from client.deadline import DEFAULT_PERIOD_NS
 from client.errors import GamesrError, ModelError
 from client.frames import Frame
-from client.governor import START_SHARE
 from client.models import find_model
 from client.upscaler import OnnxUpscaler, State, plane_shapes
 
@@ -37,9 +35,8 @@ class TieredUpscaler:
     """Models by name, the best first, each made ready for the size of the stream; set `tier` to choose. A context manager.
 
     With the step after that, the chosen model's memory begins anew: no memory is used by another network, nor one that missed frames.
-    Of several, the last leaves a core to others where it is quick enough on one thread less: on all cores a frame is done only when the
-    thread is that another process interrupts. All buffers are made by `prepare`, none by a switch. `display_height` chooses the scale,
-    2 or 3, that comes nearest to it; without, it is 2.
+    All buffers are made by `prepare`, none by a switch. `display_height` chooses the scale, 2 or 3,
+    that comes nearest to it; without, it is 2.
     It serves one stream at a time. Raises ModelError for what does not ship at the scale, and what `OnnxUpscaler` raises.
     """
 
@@ -68,9 +65,8 @@ class TieredUpscaler:
         return [upscaler.spec for upscaler in self._upscalers]
 
     @property
-    def threads(self) -> list[int]:
-        """Of each tier, in the order of `names`."""
-        return [upscaler.threads for upscaler in self._upscalers]
+    def threads(self) -> int:
+        return self._upscalers[0].threads
 
     def scale(self, height: int) -> int:
         """2 or 3, for pictures of this height."""
@@ -173,11 +169,9 @@ class _Preparation(threading.Thread):
 
     def run(self) -> None:
         try:
-            self.upscalers = list(self._tiers._load(self._tiers.scale(self.size[0])))
+            self.upscalers = self._tiers._load(self._tiers.scale(self.size[0]))
             for tier in reversed(range(len(self.upscalers))):
                 self.states[tier], self.costs_ns[tier] = self._timed(self.upscalers[tier])
-                if not self.usable.is_set() and tier:
-                    self._leave_a_core(tier)
                 self.usable.set()
         except _Stopped:
             pass
@@ -188,20 +182,10 @@ class _Preparation(threading.Thread):
             self._error = ModelError(f"the models could not be made ready for {width}x{height}: {str(error) or type(error).__name__}")
             self._error.__cause__ = error
 
-    def _leave_a_core(self, tier: int) -> None:
-        """Take the last tier on one thread less, where that leaves time for decoding a frame too."""
-        full = self.upscalers[tier]
-        if full.threads == 1:
-            return
-        less = OnnxUpscaler(find_model(self._tiers.names[tier], full.spec.scale), provider=full.provider, threads=full.threads - 1)
-        state, cost_ns = self._timed(less)
-        if cost_ns <= START_SHARE * DEFAULT_PERIOD_NS:
-            self.upscalers[tier], self.states[tier], self.costs_ns[tier] = less, state, cost_ns
-
     def _timed(self, upscaler: OnnxUpscaler) -> tuple[State, int]:
         """The buffers that frames are computed in, and the least time that one took; raises _Stopped.
 
-        After each the lock is left alone for a moment: who waits for it wakes up more slowly than this thread takes it again.
+        Before each the lock is left alone for a moment: who waits for it wakes up more slowly than this thread takes it again.
         """
         state = upscaler.initial_state(*self.size)
         grey = [np.full(shape, 128, np.uint8) for shape in plane_shapes(*self.size)]
