@@ -13,7 +13,7 @@ SPREAD = 1.1  # a frame's p95 over its median, on a machine that does nothing el
 WINDOW_FRAMES = 60
 MIN_FRAMES = 20  # fewer have no 95th percentile
 MISSES_IN_A_ROW = 3
-MOST_MISSED, MISSES_FRAMES = 6, 600  # more than one of a hundred
+MOST_MISSED, MISSES_FRAMES = 6, 600  # one of a hundred: as many as a stream may miss that keeps 99%
 HOLD_NS = 2_000_000_000  # at least, between a switch and one upwards
 LASTS_NS = 10_000_000_000  # a tier that holds so long was no mistake
 MAX_HOLD_NS = 64_000_000_000
@@ -32,7 +32,7 @@ class Switch:
 class Governor:
     """Moves between tiers, of which the first is the best, so that frames are presented within `deadline_ns` of their arrival.
 
-    `costs_ns` are the least that the tiers took for a frame in warm-up, at the stream's size; `deadline_ns` and `period_ns` may be set
+    `costs_ns` are the least that each tier took for a frame in warm-up, at the stream's size; `deadline_ns` and `period_ns` may be set
     anew at any time. A tier is begun with only if its cost is at most 0.8 of the deadline and of a frame's period.
 
     Down it goes to the best tier that should fit, or to the last: when three frames in a row missed, when three wait, when the p95

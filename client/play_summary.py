@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 from client.artifact import ModelSpec
 from client.cores import machine_name
+from client.errors import OutputError
 from client.play_tally import KEPT_FRAMES, PlayTally
 from client.summary import latency_table
-from client.timing import deadline_misses
+from client.timing import deadline_misses, stage_latencies
 
 if TYPE_CHECKING:
     from client.reception import ReceptionCounts
 
-_POSTED_STAGES = {"decode": "decode", "upscale": "upscale", "present": "write", "total": "total"}
 _POSTED_FPS = (30, 60, 120)
 
 
@@ -122,11 +122,17 @@ class PlaySummary:
         return "\n".join(lines)
 
     def posted(self) -> dict[str, object]:
-        """What `POST /api/v1/client-latencies` of gamesr-serve takes: of the tier that showed most frames, all frames' times."""
-        name = self.tally.tier_frames.most_common(1)[0][0]
+        """What `POST /api/v1/client-latencies` of gamesr-serve takes: of the last size, the times of the tier that showed most of it.
+
+        `total` is as the service's own sweep has it, decoding, upscaling and presenting. What waited before it, and what was left out, was
+        the stream's doing as much as the model's, and is in none of this. Raises OutputError where no frame of that size was timed.
+        """
+        try:
+            name, stamps = self.tally.most_shown()
+        except ValueError as error:
+            raise OutputError("nothing is posted: no frame of the last size came after the models were ready") from error
         spec, (width, height) = self.specs[name], self.tally.sizes[-1]
-        latencies = self.tally.latencies(network=False)
-        totals_ns = self.tally.durations_ns(network=False)["total"].tolist()
+        totals_ns = [passed.written_ns - passed.packet_ns for passed in stamps]
         machine = "".join(letter if " " <= letter <= "~" else "?" for letter in machine_name())[:120]
         return {
             "model": spec.name,
@@ -138,7 +144,7 @@ class PlaySummary:
             "low_width": width,
             "low_height": height,
             "scale": spec.scale,
-            "latency_us": {sent: latencies[stage].record() for stage, sent in _POSTED_STAGES.items()},
+            "latency_us": {stage: latency.record() for stage, latency in stage_latencies(stamps).items()},
             "deadline_misses": {str(fps): deadline_misses(totals_ns, fps) for fps in _POSTED_FPS},
         }
 

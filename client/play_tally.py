@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from client.governor import Switch
 from client.pipeline import FrameDone
 from client.play_source import Arrived
-from client.timing import LatencySummary
+from client.timing import LatencySummary, Stamps
 
 KEPT_FRAMES = 1 << 16  # 18 minutes at 60 fps
 FREEZE_PERIODS = 3
 _KEPT_SWITCHES = 100
-_FIRST, _LAST, _READY, _PACKET, _DECODED, _UPSCALED, _PRESENTED, _SENT = range(8)
+_FIRST, _LAST, _READY, _PACKET, _DECODED, _UPSCALED, _PRESENTED, _SENT, _TIER, _SIZE = range(10)
 _STAGES = {
     "receive": (_FIRST, _LAST),  # the network's own
     "assemble": (_LAST, _READY),
@@ -36,7 +36,7 @@ class PlayTally:
 
     `late` are shown frames that missed their deadline, `left_out` those that were not shown so that newer ones were in time,
     `unready` those that came while the tiers were made ready: the last tier showed them, if any did; nothing else counts them.
-    A freeze is a gap of more than three periods between two shown frames.
+    A freeze is a gap of more than three periods between two pictures, whoever showed them, from the first shown frame on.
     """
 
     shown: int = 0
@@ -51,13 +51,17 @@ class PlayTally:
     switched: int = 0
     switches: deque[Switch] = field(default_factory=lambda: deque(maxlen=_KEPT_SWITCHES))
     sizes: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=_KEPT_SWITCHES))  # (width, height)
+    resized: int = 0
     first_ns: int = 0  # when the first was shown
-    last_ns: int = 0
-    _stamps: NDArray[np.int64] = field(default_factory=lambda: np.full((KEPT_FRAMES, 8), -1, np.int64), repr=False)  # touched: it is there
+    last_ns: int = 0  # when the last picture was, whoever showed it
+    _stamps: NDArray[np.int64] = field(default_factory=lambda: np.full((KEPT_FRAMES, 10), -1, np.int64), repr=False)  # touched: it is there
+    _tiers: list[str] = field(default_factory=list, repr=False)
 
     def add(self, item: Arrived, done: FrameDone, *, tier: str, deadline_ns: int, period_ns: int) -> None:
         """A frame was shown."""
         stamps, now_ns = done.stamps, done.stamps.written_ns
+        if tier not in self._tiers:
+            self._tiers.append(tier)
         self._stamps[self.shown % len(self._stamps)] = (
             item.first_ns,
             item.last_ns,
@@ -67,20 +71,35 @@ class PlayTally:
             stamps.upscaled_ns,
             now_ns,
             -1 if item.sent_ns is None else item.sent_ns,
+            self._tiers.index(tier),
+            self.resized,
         )
-        if self.shown:
-            gap_ns = now_ns - self.last_ns
-            self.freezes += gap_ns > FREEZE_PERIODS * period_ns
-            self.longest_gap_ns = max(self.longest_gap_ns, gap_ns)
-        else:
+        if not self.shown:
             self.first_ns = now_ns
-        self.last_ns = now_ns
+        self._gap(now_ns, period_ns)
         self.shown += 1
         self.late += now_ns - item.last_ns > deadline_ns
         self.damaged += done.decoded.damaged
         self.tier_frames[tier] += 1
         if done.restart is not None:
             self.restarts[done.restart.name.lower()] += 1
+
+    def add_unready(self, now_ns: int, *, period_ns: int) -> None:
+        """The last tier showed a frame while the others were made ready."""
+        self.unready += 1
+        self._gap(now_ns, period_ns)
+
+    def _gap(self, now_ns: int, period_ns: int) -> None:
+        if self.shown:
+            gap_ns = now_ns - self.last_ns
+            self.freezes += gap_ns > FREEZE_PERIODS * period_ns
+            self.longest_gap_ns = max(self.longest_gap_ns, gap_ns)
+        self.last_ns = now_ns
+
+    def resize(self, size: tuple[int, int]) -> None:
+        """The picture is (width, height) from now on."""
+        self.resized += 1
+        self.sizes.append(size)
 
     def switch(self, switch: Switch) -> None:
         self.switched += 1
@@ -96,15 +115,27 @@ class PlayTally:
 
         Stages without any are left out.
         """
-        kept = len(self._stamps)
-        count = min(self.shown, kept, newest or kept)
-        rows = self._stamps[np.arange(self.shown - count, self.shown) % kept]
-        durations = {}
+        rows, durations = self._rows(newest), {}
         for stage, (begin, end) in _STAGES.items():
             known = rows[rows[:, begin] != -1] if network or stage not in _OF_THE_NETWORK else rows[:0]
             if len(known):
                 durations[stage] = known[:, end] - known[:, begin]
         return durations
+
+    def most_shown(self) -> tuple[str, list[Stamps]]:
+        """The tier that showed most of the kept frames of the present size, and their stamps; raises ValueError where there are none."""
+        rows = self._rows()
+        rows = rows[rows[:, _SIZE] == self.resized]
+        if not len(rows):
+            raise ValueError("no frame of the present size was shown")
+        tier = int(np.bincount(rows[:, _TIER]).argmax())
+        passed = rows[rows[:, _TIER] == tier][:, [_PACKET, _DECODED, _UPSCALED, _PRESENTED]]
+        return self._tiers[tier], [Stamps(*row) for row in passed.tolist()]
+
+    def _rows(self, newest: int | None = None) -> NDArray[np.int64]:
+        kept = len(self._stamps)
+        count = min(self.shown, kept, newest or kept)
+        return self._stamps[np.arange(self.shown - count, self.shown) % kept]
 
     def latencies(self, *, network: bool, newest: int | None = None) -> dict[str, LatencySummary]:
         durations = self.durations_ns(network=network, newest=newest)

@@ -103,8 +103,7 @@ class Player:
         for item in self._source.frames(self._idle):
             frame, tally = item.frame, self.tally
             self.period.add(frame)
-            if not self._tiers.ready(frame.height, frame.width):
-                tally.unready += 1
+            if not self._ready(frame):
                 self._idle()
                 continue
             now_ns, waiting = time.perf_counter_ns(), self._source.waiting()
@@ -123,6 +122,17 @@ class Player:
             self._decoded(frame)
             yield item
 
+    def _ready(self, frame: Frame) -> bool:
+        """Whether it can be upscaled: not while the tiers are made ready for its size, and never where that would be too large."""
+        try:
+            if self._tiers.ready(frame.height, frame.width):
+                return True
+        except InputError as error:
+            self._tell("refused", f"not shown: {error}")
+            return False
+        self.tally.unready += 1
+        return False
+
     def _leaves_out(self, age_ns: int, waiting: int) -> bool:
         governor = self.governor
         frame_ns = self._tiers.costs_ns[-1] if governor is None else governor.frame_ns
@@ -134,7 +144,7 @@ class Player:
         """A picture of another size, or the first: the last tier shows it until all are ready."""
         tiers, before = self._tiers, self._size
         self._size, self.governor = (frame.width, frame.height), None
-        self.tally.sizes.append(self._size)
+        self.tally.resize(self._size)
         if before is not None:
             self._why = "the picture changed size"
             self._tell("size", f"the picture is now {frame.width}x{frame.height}, it was {before[0]}x{before[1]}")
@@ -157,7 +167,7 @@ class Player:
             self._why = _READY
         self._shown_tier = self._tiers.tier
         if governor is None:
-            self.tally.unready += 1
+            self.tally.add_unready(stamps.written_ns, period_ns=self.period.ns)
             return
         self.tally.add(item, done, tier=self._tiers.names[self._tiers.tier], deadline_ns=governor.deadline_ns, period_ns=self.period.ns)
         self._follow(

@@ -17,6 +17,7 @@ from client.models import find_model
 from client.upscaler import OnnxUpscaler, State, plane_shapes
 
 TIMED_FRAMES = 5
+_PAUSE_S = 0.001
 
 
 class TieredState:
@@ -75,12 +76,14 @@ class TieredUpscaler:
     def ready(self, height: int, width: int) -> bool:
         """Whether pictures of this size can be upscaled, with the last tier at least; the first question about a size begins that.
 
-        It runs in a thread, from the last tier to the first, so that decoding goes on. Raises what it raised.
+        It runs in a thread, from the last tier to the first, so that decoding goes on. Raises what it raised, and ModelError for anything
+        that is no GamesrError.
         """
-        if self.size == (height, width) and (self._preparation is None or self._preparation.size == self.size):
-            return True
-        if self._preparation is None or self._preparation.size != (height, width):
+        if self._preparation is not None and self._preparation.size != (height, width):
             self.close()  # one at a time: a stream cannot have more made by changing faster
+        if self.size == (height, width):
+            return True
+        if self._preparation is None:
             self._preparation = _Preparation(self, height, width)
             self._preparation.start()
         preparation = self._preparation
@@ -105,10 +108,12 @@ class TieredUpscaler:
             time.sleep(0.01)
 
     def close(self) -> None:
-        """Wait for the thread, which ends with the tier that it is at."""
+        """Wait for the thread, which ends with the frame that it is at; a size of which only some tiers are ready is begun anew."""
         if self._preparation is not None:
-            self._preparation.stop = True
+            self._preparation.stop.set()
             self._preparation.join()
+            if self._preparation.size == self.size:
+                self.size = None
             self._preparation = None
 
     def initial_state(self, height: int, width: int) -> TieredState:
@@ -144,13 +149,17 @@ class TieredUpscaler:
         return self._loaded[scale]
 
 
+class _Stopped(Exception):
+    """Another size is wanted by now."""
+
+
 class _Preparation(threading.Thread):
     """Makes each tier's buffers for a size, has it run and times it; the lists are filled as it goes."""
 
     def __init__(self, tiers: TieredUpscaler, height: int, width: int) -> None:
         super().__init__(name="tiers", daemon=True)
         self.size = height, width
-        self.stop = False
+        self.stop = threading.Event()
         self.usable = threading.Event()
         self.upscalers: list[OnnxUpscaler] = []
         self.states: dict[int, State] = {}
@@ -162,26 +171,35 @@ class _Preparation(threading.Thread):
         try:
             self.upscalers = self._tiers._load(self._tiers.scale(self.size[0]))
             for tier in reversed(range(len(self.upscalers))):
-                if self.stop:
-                    break
-                self.states[tier], self.costs_ns[tier] = _timed(self.upscalers[tier], *self.size, self._tiers.computing)
+                self.states[tier], self.costs_ns[tier] = self._timed(self.upscalers[tier])
                 self.usable.set()
+        except _Stopped:
+            pass
         except GamesrError as error:
             self._error = error
+        except Exception as error:  # the stream waits for this thread: whatever ends it is said there
+            height, width = self.size
+            self._error = ModelError(f"the models could not be made ready for {width}x{height}: {str(error) or type(error).__name__}")
+            self._error.__cause__ = error
+
+    def _timed(self, upscaler: OnnxUpscaler) -> tuple[State, int]:
+        """The buffers that frames are computed in, and the least time that one took; raises _Stopped.
+
+        Before each the lock is left alone for a moment: who waits for it wakes up more slowly than this thread takes it again.
+        """
+        state = upscaler.initial_state(*self.size)
+        grey = [np.full(shape, 128, np.uint8) for shape in plane_shapes(*self.size)]
+        frame = Frame(grey[0], grey[1], grey[2])
+        durations_ns = []
+        for _ in range(2 + TIMED_FRAMES):  # both bindings have run before anything counts
+            if self.stop.wait(_PAUSE_S):
+                raise _Stopped
+            with self._tiers.computing:
+                begin_ns = time.perf_counter_ns()
+                _, state = upscaler.step(frame, state)
+                durations_ns.append(time.perf_counter_ns() - begin_ns)
+        return state, min(durations_ns[2:])
 
     def check(self) -> None:
         if self._error is not None:
             raise self._error
-
-
-def _timed(upscaler: OnnxUpscaler, height: int, width: int, computing: threading.Lock) -> tuple[State, int]:
-    """The buffers that frames of this size are computed in, and the least time that one took; between two, others may compute."""
-    grey = [np.full(shape, 128, np.uint8) for shape in plane_shapes(height, width)]
-    frame, state = Frame(grey[0], grey[1], grey[2]), upscaler.initial_state(height, width)
-    durations_ns = []
-    for _ in range(2 + TIMED_FRAMES):  # both bindings have run before anything counts
-        with computing:
-            begin_ns = time.perf_counter_ns()
-            _, state = upscaler.step(frame, state)
-            durations_ns.append(time.perf_counter_ns() - begin_ns)
-    return state, min(durations_ns[2:])

@@ -17,6 +17,7 @@ from av.video.frame import VideoFrame
 from onnx import TensorProto, helper
 
 from client.frames import Frame
+from client.tiers import TieredUpscaler
 from client.video import to_av_frame
 from client.window import Window
 
@@ -102,6 +103,15 @@ def model_file(tmp_path: Path) -> Callable[..., Path]:
         return path
 
     return save
+
+
+@pytest.fixture
+def tiers(model_file: Callable[..., Path]) -> TieredUpscaler:
+    """Two recurrent tiers with different pictures and one without a state."""
+    files = [model_file("a.onnx", gain=0.9), model_file("b.onnx", gain=0.3), model_file("c.onnx", stateful=False)]
+    made = TieredUpscaler([str(file) for file in files], display_height=None, provider="cpu", threads=1)
+    made.prepare(32, 48)
+    return made
 
 
 def picture(index: int, width: int = WIDTH, height: int = HEIGHT, pix_fmt: str = "yuv420p") -> VideoFrame:

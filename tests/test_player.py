@@ -14,27 +14,26 @@ from typing import Self
 import numpy as np
 import pytest
 
-import client.tiers
-from client.errors import InputError, ModelError
+from client.errors import InputError
 from client.frames import Frame
 from client.play_source import Arrived, Idle
-from client.play_tally import PlayTally
+from client.play_tally import FREEZE_PERIODS, PlayTally
 from client.player import Player
 from client.sink import NullSink
-from client.tiers import TieredUpscaler
+from client.tiers import TieredUpscaler, _Preparation
 from client.upscaler import OnnxUpscaler, State
 from tests.moving import picture
 from tests.playing import LONG_NS, Kept, Told
 from tests.streaming import planes
 
 ModelFile = Callable[..., Path]
-FPS = 60
 
 
 class Script:
     """A source that plays frames at once; `waits` says how many newer ones wait behind each, `ages_ns` how old each is."""
 
     name = "script"
+    fps = 60
     reception = None
     decode_errors = 0
 
@@ -57,7 +56,7 @@ class Script:
             self._index = index
             now_ns = time.perf_counter_ns()
             at_ns = now_ns - self._age_ns
-            timed = replace(frame, pts=index, time_base=Fraction(1, FPS))
+            timed = replace(frame, pts=index, time_base=Fraction(1, self.fps))
             yield Arrived(timed, now_ns, now_ns, at_ns, at_ns, at_ns, None)
         for _ in range(self._idles):
             idle()
@@ -65,15 +64,6 @@ class Script:
 
 def moving(count: int, height: int = 32, width: int = 48) -> list[Frame]:
     return [picture(t, height, width) for t in range(count)]
-
-
-@pytest.fixture
-def tiers(model_file: ModelFile) -> TieredUpscaler:
-    """Two recurrent tiers with different pictures and one without a state."""
-    files = [model_file("a.onnx", gain=0.9), model_file("b.onnx", gain=0.3), model_file("c.onnx", stateful=False)]
-    made = TieredUpscaler([str(file) for file in files], display_height=None, provider="cpu", threads=1)
-    made.prepare(32, 48)
-    return made
 
 
 def player(source: Script, tiers: TieredUpscaler, sink: Kept | NullSink, **options: object) -> tuple[Player, Told]:
@@ -114,47 +104,6 @@ def test_even_then_the_picture_moves(tiers: TieredUpscaler) -> None:
     assert [frame.pts for frame in sink.pictures] == [10, 31]  # after twice the five, and twice that again
 
 
-@pytest.mark.parametrize(("before", "after"), [(0, 1), (1, 0), (0, 2), (2, 0), (2, 1)])
-def test_a_switch_is_no_flash(tiers: TieredUpscaler, before: int, after: int) -> None:
-    """A picture that stands still: over the switch it moves by no more than the two tiers' own pictures of it differ."""
-    still = picture(3, 32, 48)
-    state, pictures = tiers.initial_state(32, 48), []
-    for number in range(12):
-        tiers.tier = before if number < 6 else after
-        shown, state = tiers.step(still, state)
-        pictures.append(shown)
-    own = []
-    for tier in (before, after):
-        alone = OnnxUpscaler(Path(tiers.names[tier]), threads=1)
-        memory, seen = alone.initial_state(32, 48), []
-        for _ in range(6):
-            result, memory = alone.step(still, memory)
-            seen.append(result)
-        own.append(seen)
-    assert [planes(shown) for shown in pictures] == [planes(shown) for seen in own for shown in seen]  # each from an empty memory
-    step = np.abs(pictures[6].y.astype(int) - pictures[5].y).max()
-    assert step <= max(np.abs(a.y.astype(int) - b.y).max() for a in own[0] for b in own[1])
-
-
-def test_a_tier_that_comes_back_remembers_nothing(tiers: TieredUpscaler) -> None:
-    frames, state = moving(9), tiers.initial_state(32, 48)
-    for number, frame in enumerate(frames):
-        tiers.tier = 1 if 3 <= number < 6 else 0
-        shown, state = tiers.step(frame, state)
-    alone = OnnxUpscaler(Path(tiers.names[0]), threads=1)
-    memory = alone.initial_state(32, 48)
-    for frame in frames[6:]:
-        want, memory = alone.step(frame, memory)
-    assert planes(shown) == planes(want)
-
-
-def test_a_state_of_before_is_refused(tiers: TieredUpscaler) -> None:
-    state = tiers.initial_state(32, 48)
-    tiers.initial_state(32, 48)
-    with pytest.raises(ValueError, match="begun anew"):
-        tiers.step(picture(0, 32, 48), state)
-
-
 def test_another_size_in_mid_stream(tiers: TieredUpscaler) -> None:
     """Frames that come while the tiers are made ready for it are decoded, and shown by the last tier if any; then it goes on by itself."""
     sink = Kept()
@@ -174,23 +123,6 @@ def test_another_size_in_mid_stream(tiers: TieredUpscaler) -> None:
     assert tally.restarts == {"size": 1} and [kind for kind in told.kinds() if kind != "unready"] == ["begin", "size", "begin"]
 
 
-def test_a_display_chooses_the_scale(model_file: ModelFile, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = {scale: model_file(f"t_x{scale}.onnx", scale=scale) for scale in (2, 3)}
-    monkeypatch.setattr("client.tiers.find_model", lambda name, scale: files[scale])
-    made = TieredUpscaler(["t"], display_height=108, provider="cpu", threads=1)
-    for height, scale in ((36, 3), (54, 2), (40, 3), (48, 2), (12, 3)):
-        made.prepare(height, 48)
-        assert made.specs[0].scale == scale
-
-
-def test_tiers_that_do_not_go_together(model_file: ModelFile) -> None:
-    files = [str(model_file(f"t{scale}.onnx", scale=scale)) for scale in (2, 3)]
-    with pytest.raises(ModelError, match="different scales"):
-        TieredUpscaler(files, display_height=None, provider="cpu", threads=1)
-    with pytest.raises(ModelError, match="no model named 'nothing'"):
-        TieredUpscaler(["bicubic", "nothing"], display_height=None, provider="cpu", threads=1)
-
-
 def test_it_ends_when_it_is_told_to(tiers: TieredUpscaler) -> None:
     playing, _ = player(Script(moving(8)), tiers, NullSink(), frames=5)
     assert playing.play() == "5 frames were shown" and playing.tally.shown == 5
@@ -204,14 +136,14 @@ def test_it_ends_when_it_is_told_to(tiers: TieredUpscaler) -> None:
 def test_the_last_tier_shows_it_until_all_are_ready(model_file: ModelFile, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those frames are in no latency; what the governor begins with comes after them."""
     gate = threading.Event()
-    timed = client.tiers._timed
+    timed = _Preparation._timed
 
-    def slowly(upscaler: OnnxUpscaler, height: int, width: int, computing: threading.Lock) -> tuple[State, int]:
+    def slowly(self: _Preparation, upscaler: OnnxUpscaler) -> tuple[State, int]:
         if upscaler.spec.state:
             assert gate.wait(60)
-        return timed(upscaler, height, width, computing)
+        return timed(self, upscaler)
 
-    monkeypatch.setattr("client.tiers._timed", slowly)
+    monkeypatch.setattr(_Preparation, "_timed", slowly)
     files = [str(model_file("a.onnx")), str(model_file("c.onnx", stateful=False))]
     sink = Kept()
     with TieredUpscaler(files, display_height=None, provider="cpu", threads=1) as tiers:
@@ -236,30 +168,82 @@ def test_the_last_tier_shows_it_until_all_are_ready(model_file: ModelFile, monke
         assert planes(plain.step(frame, plain.initial_state(32, 48))[0]) == planes(shown)
 
 
-def test_what_plays_does_not_slow_down_what_is_timed(model_file: ModelFile, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One model computes at a time, also while a thread makes the other tiers ready."""
-    at_work, most, step = 0, 0, OnnxUpscaler.step
+@pytest.mark.parametrize("complete", [False, True])
+def test_a_size_that_goes_and_comes_back_in_warm_up(tiers: TieredUpscaler, monkeypatch: pytest.MonkeyPatch, complete: bool) -> None:
+    """Another size for three pictures. If all tiers were ready for the first it goes on as if nothing had been; else they are made anew."""
+    timed = _Preparation._timed
 
-    def counting(self: OnnxUpscaler, frame: Frame, state: State) -> tuple[Frame, State]:
-        nonlocal at_work, most
-        at_work += 1
-        most = max(most, at_work)
-        time.sleep(0.002)
-        try:
-            return step(self, frame, state)
-        finally:
-            at_work -= 1
+    def slowly(self: _Preparation, upscaler: OnnxUpscaler) -> tuple[State, int]:
+        if self.size != (48, 64) or upscaler.spec.state:
+            self.stop.wait(0.2)  # too slow for what comes here
+        return timed(self, upscaler)
 
-    monkeypatch.setattr(OnnxUpscaler, "step", counting)
-    names = [str(model_file(f"tier{number}.onnx", stateful=True)) for number in range(3)]
-    with TieredUpscaler(names, display_height=None, provider="cpu", threads=1) as tiers:
-        while not tiers.ready(32, 48):
-            time.sleep(0.001)
-        assert not tiers.complete
-        frame, state = picture(0, 32, 48), tiers.initial_state(32, 48)
-        while not tiers.complete:
-            _, state = tiers.step(frame, state)
-    assert most == 1
+    class Returning(Script):
+        def frames(self, idle: Idle) -> Iterator[Arrived]:
+            for item in super().frames(idle):
+                if item.frame.pts == 10:
+                    tiers.prepare(48, 64)
+                yield item
+
+    monkeypatch.setattr(_Preparation, "_timed", slowly)
+    if complete:
+        tiers.prepare(48, 64)
+    while not tiers.ready(48, 64):
+        time.sleep(0.001)
+    playing, told = player(Returning(moving(4, 48, 64) + moving(3) + moving(9, 48, 64)), tiers, NullSink())
+    playing.play()
+    assert (playing.tally.unready, playing.tally.shown) == ((3, 13) if complete else (10, 6))
+    assert told.kinds() == (["begin"] if complete else ["unready", "begin"])
+    assert playing.governor is not None and playing.governor.tier == tiers.tier and all(tiers.costs_ns)
+
+
+def test_what_is_too_large_is_not_shown_and_ends_nothing(tiers: TieredUpscaler) -> None:
+    huge = Frame(np.broadcast_to(np.uint8(9), (8192, 8192)), *[np.broadcast_to(np.uint8(9), (4096, 4096))] * 2)
+    sink = Kept()
+
+    class Slowly(Script):
+        def frames(self, idle: Idle) -> Iterator[Arrived]:
+            for item in super().frames(idle):
+                yield item
+                while tiers._preparation is not None and tiers._preparation.is_alive():
+                    time.sleep(0.001)
+
+    playing, told = player(Slowly(moving(3) + [huge] * 3 + moving(3)), tiers, sink)
+    assert playing.play() == "the stream ended"
+    assert len(sink.pictures) == 6 and playing.tally.shown == 6 and playing.tally.unready <= 1
+    assert told.kinds().count("refused") >= 2 and "8192x8192" in dict(told.said)["refused"]
+
+
+def test_what_the_last_tier_shows_is_no_freeze(tiers: TieredUpscaler, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a change of size only the last tier is ready for longer than a freeze takes, and the picture moves all the time."""
+    gate, timed = threading.Event(), _Preparation._timed
+
+    def slowly(self: _Preparation, upscaler: OnnxUpscaler) -> tuple[State, int]:
+        assert not upscaler.spec.state or gate.wait(60)
+        return timed(self, upscaler)
+
+    class Paced(Script):
+        fps = 5
+
+        def frames(self, idle: Idle) -> Iterator[Arrived]:
+            for item in super().frames(idle):
+                if item.frame.pts == 3:
+                    while not tiers.ready(64, 96):
+                        time.sleep(0.001)
+                if item.frame.pts == 19:
+                    gate.set()
+                    tiers.prepare(64, 96)
+                time.sleep(0.05)
+                yield item
+
+    monkeypatch.setattr(_Preparation, "_timed", slowly)
+    playing, _ = player(Paced(moving(3) + moving(18, 64, 96)), tiers, NullSink())
+    playing.play()
+    tally = playing.tally
+    assert (tally.unready, tally.shown, tally.freezes) == (16, 5, 0)
+    assert tally.last_ns - tally.first_ns > FREEZE_PERIODS * playing.period.ns > tally.longest_gap_ns
+    tally.add_unready(tally.last_ns + 2 * FREEZE_PERIODS * playing.period.ns, period_ns=playing.period.ns)
+    assert tally.freezes == 1  # whoever shows it
 
 
 def test_nothing_shown_is_said(tiers: TieredUpscaler) -> None:
