@@ -84,7 +84,7 @@ def open_source(text: str, *, until_bye: bool, tell: Tell) -> PlaySource:
         try:
             urlsplit(text)
         except ValueError as error:
-            raise InputError(f"{text} is no URL") from error
+            raise InputError(f"{shown_url(text)} is no URL") from error
         return UrlSource(text, until_bye=until_bye, tell=tell)
     if _ADDRESS.fullmatch(text) and not Path(text).exists():
         return _listen(text, until_bye, tell)
@@ -122,9 +122,23 @@ def _described(path: Path, until_bye: bool, tell: Tell) -> PlaySource:
 
 
 def shown_url(url: str) -> str:
-    """A URL without name, password and query, for people to read."""
-    parts = urlsplit(url)
-    return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
+    """A URL without name, password and query, for people to read.
+
+    Of what is none, or may have / ? or # in its password, nothing but the scheme.
+    """
+    scheme = url.partition("://")[0]
+    try:
+        parts = urlsplit(url)
+    except ValueError:
+        return f"{scheme}://..."
+    if "@" in parts.path + parts.query + parts.fragment:
+        return f"{scheme}://..."
+    return f"{scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
+
+
+def shown_source(text: str) -> str:
+    """What `open_source` is given, for people to read."""
+    return shown_url(text) if "://" in text else text
 
 
 class FileSource:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import ssl
 import threading
 import time
 from collections import deque
@@ -19,10 +21,14 @@ from client.video import CONTAINERS, OpenVideo
 PROTOCOLS = ("rtsp", "rtsps", "udp", "tcp", "http", "https")
 _ENDING = ("http", "https")  # a file lies there: its end is the end
 _BENEATH = "rtp,udp,tcp,tls,http,https,rtsp,rtsps"  # never file, pipe or concat, whatever an answer says
+_TLS = ("https", "rtsps")
 _OPTIONS = {
     "protocol_whitelist": _BENEATH,
     "format_whitelist": f"{CONTAINERS},rtsp",  # no playlists: they name other addresses
     "analyzeduration": "1000000",  # what was read for it comes in a burst, of which the deadline rule shows the newest
+    "fpsprobesize": "0",  # the frame rate follows from the timestamps: measuring it first takes most of a second more
+    "rtsp_flags": "prefer_tcp",  # nothing tells of a packet that UDP lost, and firewalls let nothing of it through
+    "tls_verify": "1",
 }
 _OPEN_S, _READ_S = 5.0, 5.0
 _RETRY_S = 1.0
@@ -32,7 +38,9 @@ _PACKETS_QUEUED = 64
 class UrlSource:
     """A stream that FFmpeg opens, of any codec that it decodes; opened again, every second, when it ended or was silent for 5 s.
 
-    With `until_bye`, and over HTTP, the end is the end. Raises InputError where it cannot be opened the first time.
+    With `until_bye`, and over HTTP, the end is the end. RTSP carries its RTP in the same connection where the server can, else by UDP.
+    Certificates are held against those that Python's ssl trusts (the file in SSL_CERT_FILE). Raises InputError where it cannot be opened
+    the first time.
     """
 
     reception = None
@@ -60,11 +68,15 @@ class UrlSource:
         return 0 if self._reader is None else len(self._reader.packets)
 
     def frames(self, idle: Idle) -> Iterator[Arrived]:
-        begun = False
+        begun = gone = False
         while True:
             self._reader = reader = _Reader(self._url, self.name)
             reader.start()
-            yield from reader.frames(idle, self._tell)
+            for frame in reader.frames(idle, self._tell):
+                if gone:
+                    gone = False
+                    self._tell("sender", "the stream is there again")
+                yield frame
             if reader.error is not None and not begun:
                 raise reader.error
             begun |= reader.opened
@@ -72,7 +84,13 @@ class UrlSource:
             self._errors, self._reader = self.decode_errors, None
             if self._ends:
                 return
-            self._tell("goodbye", "the stream ended or was silent too long: opening it again")
+            gone = True
+            if reader.error is not None:
+                self._tell("unreachable", f"{reader.error}; trying again every second")
+            elif reader.silent:
+                self._tell("silence", f"nothing has come for {_READ_S:g} s: opening it again")
+            else:
+                self._tell("goodbye", "the stream ended or broke off: opening it again")
             again = time.monotonic() + _RETRY_S
             while time.monotonic() < again:
                 idle()
@@ -86,7 +104,7 @@ class _Reader(threading.Thread):
         super().__init__(name="url-reader", daemon=True)
         self.packets: deque[tuple[int, av.Packet[VideoStream]]] = deque()
         self.error: InputError | None = None
-        self.opened = False
+        self.opened = self.silent = False
         self._url, self._name = url, name
         self._video: OpenVideo | None = None
         self._changed = threading.Condition()
@@ -94,7 +112,7 @@ class _Reader(threading.Thread):
 
     @property
     def decode_errors(self) -> int:
-        return 0 if self._video is None else self._video.decode_errors
+        return 0 if self._video is None else self._video.decode_errors - self._video.broke_off
 
     def close(self) -> None:
         """It ends with the next packet, or when none comes in time; nobody waits for that."""
@@ -123,16 +141,14 @@ class _Reader(threading.Thread):
                 yield Arrived(frame.frame, frame.packet_ns, frame.decoded_ns, arrived_ns, arrived_ns, arrived_ns, None)
 
     def run(self) -> None:
+        begin_s = time.monotonic()
         try:
-            container = av.open(self._url, "r", options=dict(_OPTIONS), timeout=(_OPEN_S, _READ_S))
+            container = av.open(self._url, "r", options=_OPTIONS | _trusted(), timeout=(_OPEN_S, _READ_S))
             self._video = OpenVideo(self._name, container)
             self.opened = True
-            for packet in self._video.packets():
-                self._put(packet)
-                if self._closed:
-                    break
+            self._read(self._video)
         except (av.FFmpegError, OSError, ValueError) as error:
-            reason = "nothing came" if isinstance(error, av.error.ExitError) else getattr(error, "strerror", None) or "it is no URL"
+            reason = _reason(self._url, error, time.monotonic() - begin_s)
             self.error = InputError(f"{self._name} cannot be opened: {reason}")
         except InputError as error:
             self.error = error
@@ -143,6 +159,17 @@ class _Reader(threading.Thread):
                     self._video.__exit__(None, None, None)
                 self._changed.notify_all()
 
+    def _read(self, video: OpenVideo) -> None:
+        before_s = time.monotonic()
+        for packet in video.packets():
+            now_s = time.monotonic()
+            # After silence FFmpeg gives out what it held, as if that had come, and for each piece would wait anew.
+            self.silent = now_s - before_s >= _READ_S
+            before_s = now_s
+            self._put(packet)
+            if self._closed or self.silent:
+                break
+
     def _put(self, packet: av.Packet[VideoStream]) -> None:
         with self._changed:
             if len(self.packets) >= _PACKETS_QUEUED:
@@ -150,3 +177,18 @@ class _Reader(threading.Thread):
                 self._overflowed = True
             self.packets.append((time.perf_counter_ns(), packet))
             self._changed.notify_all()
+
+
+def _trusted() -> dict[str, str]:
+    """The file of certificates to believe: FFmpeg inside PyAV's wheels does not know the system's."""
+    file = ssl.get_default_verify_paths().cafile
+    return {} if file is None else {"ca_file": file}
+
+
+def _reason(url: str, error: Exception, after_s: float) -> str:
+    """Why a URL could not be opened, given what was raised and after how long."""
+    if isinstance(error, av.error.ExitError) or (isinstance(error, av.error.InvalidDataError) and after_s >= _OPEN_S):
+        return f"nothing came for {_OPEN_S:g} s"  # RTSP makes invalid data of an answer that was given up
+    if url.partition("://")[0].lower() in _TLS and isinstance(error, OSError) and error.errno == errno.EIO:
+        return "there is no TLS connection, perhaps because its certificate is not trusted (SSL_CERT_FILE says which are) or another host's"
+    return getattr(error, "strerror", None) or "it is no URL"

@@ -143,6 +143,8 @@ def test_y4m_is_whole_or_not_at_all(tmp_path: Path) -> None:
         ("subfile,,start,0,end,9,,:/etc/passwd", "does not exist"),
         ("crypto+http://127.0.0.1/x", "is not played"),
         ("http://[", "is no URL"),
+        ("rtsp://me:secret@[::1/x", "is no URL"),
+        ("rtsp://me:sec/ret@127.0.0.1/x", "rtsp://... cannot be opened"),
         ("http://127.0.0.1:1/x.mp4", "cannot be opened: Connection refused"),
         ("rtsp://me:secret@127.0.0.1:1/x", "rtsp://127.0.0.1:1/x cannot be opened"),
         ("none.sdp", "cannot be read"),
@@ -329,6 +331,24 @@ def test_a_window_is_a_sink_like_another(play: Play, make_clip: MakeClip, monkey
 
 def test_urls_are_shown_without_secrets() -> None:
     assert shown_url("rtsp://me:secret@example.org:8554/game?token=x#y") == "rtsp://example.org:8554/game"
+    for password in ("sec/ret", "sec?ret", "sec#ret"):  # each has to be quoted, and is often not
+        assert "sec" not in shown_url(f"rtsp://me:{password}@example.org/game") and "ret" not in shown_url(
+            f"rtsp://me:{password}@example.org"
+        )
+
+
+def test_the_windows_title_holds_no_password(play: Play, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("sdl2")
+    titles = []
+
+    def window(title: str, *, fullscreen: bool) -> None:
+        titles.append(title)
+        raise OutputError("no window")
+
+    monkeypatch.setattr("client.window.Window", window)
+    for source in ("rtsp://me:secret@127.0.0.1:1/x", "127.0.0.1:5004", "http://me:secret@["):
+        play(source, "--sink", "window")
+    assert titles == ["gamesr-play rtsp://127.0.0.1:1/x", "gamesr-play 127.0.0.1:5004", "gamesr-play http://..."]
 
 
 def test_the_lines_of_the_docs_are_ours() -> None:

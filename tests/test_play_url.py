@@ -70,14 +70,15 @@ def waiting_at_most() -> Callable[[], None]:
 
 
 def test_silence_is_given_up_and_it_is_opened_again(make_clip: MakeClip) -> None:
-    clip, told, items = make_clip("clip.ts"), Told(), list[Arrived]()
+    clip, told, items, again = make_clip("clip.ts"), Told(), list[Arrived](), list[Arrived]()
     want = [planes(frame) for frame in read_frames(clip)]
     with server(clip.read_bytes(), silent=1) as url, open_source(url, until_bye=False, tell=told) as source:
         for item in source.frames(waiting_at_most()):
-            items.append(item)
-            if len(items) == 2 * len(want):
+            (again if told.kinds() else items).append(item)
+            if len(again) == len(want):
                 break
-    assert [planes(item.frame) for item in items] == 2 * want and told.kinds() == ["goodbye"]
+    assert [planes(item.frame) for item in again] == want and told.kinds() == ["silence", "sender"] and not source.decode_errors
+    assert len(items) >= len(want) - 1 and [planes(item.frame) for item in items] == want[: len(items)]  # the last one FFmpeg may hold
     assert all(item.last_ns <= item.packet_ns and item.sent_ns is None for item in items) and source.reception is None
 
 
