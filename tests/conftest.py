@@ -1,4 +1,4 @@
-"""Tiny artifacts and tiny clips, made where they are needed."""
+"""Tiny artifacts, tiny clips and windows without a screen, made where they are needed."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from onnx import TensorProto, helper
 
 from client.frames import Frame
 from client.video import to_av_frame
+from client.window import Window
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch's threads cost more than they bring on pictures of this size
 
@@ -160,6 +161,18 @@ def make_clip(tmp_path: Path) -> Callable[..., Path]:
         return path
 
     return write
+
+
+@pytest.fixture
+def no_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows open by SDL's dummy driver."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+
+@pytest.fixture
+def window(no_screen: None) -> Iterator[Window]:
+    with Window("test") as window:
+        yield window
 
 
 @pytest.fixture(autouse=True)

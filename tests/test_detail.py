@@ -14,28 +14,13 @@ from client.detail import SQUARE, DetailState, DetailUpscaler, gradient_energy, 
 from client.errors import ModelError, ProviderError
 from client.frames import Frame
 from client.models import find_model
-from client.upscaler import OnnxUpscaler, State
+from client.upscaler import OnnxUpscaler
 from model.export import export_network
 from tests.networks import random_network
+from tests.stepping import Spy, whole
 
 ModelFile = Callable[..., Path]
 HEIGHT, WIDTH = 200, 330  # 4 x 6 squares, the last ones cut off
-
-
-class Spy(OnnxUpscaler):
-    """Writes down the size of every frame or window that goes through the session."""
-
-    def __init__(self, model: Path) -> None:
-        super().__init__(model, threads=1)
-        self.sizes: list[tuple[int, int]] = []
-
-    def step(self, frame: Frame, state: State) -> tuple[Frame, State]:
-        self.sizes.append((frame.height, frame.width))
-        return super().step(frame, state)
-
-    def taken(self) -> list[tuple[int, int]]:
-        sizes, self.sizes = self.sizes, []
-        return sizes
 
 
 @pytest.fixture(scope="module")
@@ -73,10 +58,6 @@ def patch(*places: tuple[int, int]) -> Frame:
         square += (np.indices(square.shape).sum(0) % 2 * 50).astype(np.uint8)
     chroma = np.full((HEIGHT // 2, WIDTH // 2), 128, np.uint8)
     return Frame(y, chroma, chroma)
-
-
-def whole(upscaler: OnnxUpscaler, frame: Frame) -> Frame:
-    return upscaler.step(frame, upscaler.initial_state(frame.height, frame.width))[0]
 
 
 def one(upscaler: DetailUpscaler, frame: Frame) -> tuple[Frame, DetailState]:

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import av
@@ -134,15 +135,24 @@ def test_mkv_cut_short_is_said(saved: Run, make_clip: MakeClip, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_flipped_bits(saved: Run, make_clip: MakeClip, tmp_path: Path, seed: int) -> None:
-    content = bytearray(make_clip("clip.h264", options={"g": "4", "crf": "10"}).read_bytes())
+@pytest.mark.parametrize(("spans", "least_ends"), [([(1 / 3, 1.0)], 0), ([(0.25, 0.3), (0.6, 0.65)], 2)], ids=["to the end", "twice"])
+def test_flipped_bits(
+    saved: Run, make_clip: MakeClip, tmp_path: Path, spans: list[tuple[float, float]], least_ends: int, seed: int
+) -> None:
+    """Twelve bits in these spans of a stream that has a key frame in two; the state starts again where damage ends, and nowhere else."""
+    content = bytearray(make_clip("clip.h264", options={"g": "2", "crf": "10"}).read_bytes())
     rng = np.random.default_rng(seed)
-    for position in rng.integers(len(content) // 3, len(content), 12):
-        content[position] ^= 1 << int(rng.integers(8))
-    record = saved(write(tmp_path / "flipped.h264", bytes(content)))
+    for start, stop in spans:
+        for position in rng.integers(int(start * len(content)), int(stop * len(content)), 12 // len(spans)):
+            content[position] ^= 1 << int(rng.integers(8))
+    flipped = write(tmp_path / "flipped.h264", bytes(content))
+    record = saved(flipped)
     assert FRAMES // 3 <= record["frames"] <= FRAMES
     assert record["frames"] + record["decode_errors"] >= FRAMES - 1
-    assert record["state_resets"] <= record["damaged_frames"]  # once where damage ends, if it does
+    damaged = [frame.damaged for frame in read_frames(flipped)]
+    ends = sum(before and not after for before, after in pairwise(damaged))
+    assert ends >= least_ends  # the flips did what they are there for
+    assert (record["damaged_frames"], record["state_resets"]) == (sum(damaged), ends)
 
 
 def packets_of(clip: Path) -> list[bytes]:

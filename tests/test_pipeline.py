@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from client.errors import OutputError
-from client.frames import Frame
 from client.pipeline import FrameDone, Restart, upscale_stream
 from client.sink import FileSink, NullSink
 from client.timing import LatencySummary, Stamps, stage_latencies
 from client.upscaler import OnnxUpscaler
 from client.video import Decoded, VideoSource, read_frames
 from tests.conftest import FRAMES, HEIGHT, WIDTH
+from tests.stepping import same
 
 MakeClip = Callable[..., Path]
 B_FRAMES = {"bf": "3", "b-adapt": "0", "g": "6"}
@@ -35,10 +35,6 @@ def through(clip: Path, upscaler: OnnxUpscaler, output: Path | None = None) -> l
             return list(upscale_stream(source, upscaler, NullSink()))
         with FileSink(output, source) as sink:
             return list(upscale_stream(source, upscaler, sink))
-
-
-def same(a: Frame, b: Frame) -> bool:
-    return all(np.array_equal(p, q) for p, q in zip((a.y, a.u, a.v), (b.y, b.u, b.v), strict=True))
 
 
 def test_pipeline_equals_stepping_by_hand(make_clip: MakeClip, upscaler: OnnxUpscaler) -> None:

@@ -7,28 +7,22 @@ import os
 import signal
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from fractions import Fraction
-from http.server import BaseHTTPRequestHandler, HTTPServer
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import av
-import numpy as np
 import pytest
 
 from client import play_cli
-from client.errors import InputError, OutputError
-from client.frames import ColourTags, Frame
+from client.errors import OutputError
+from client.frames import Frame
 from client.play_post import PATH, post_summary
-from client.play_sink import Resizer, Y4mSink
-from client.play_source import open_source, shown_url
 from client.upscaler import OnnxUpscaler
-from client.video import from_av_frame, read_frames
+from client.video import read_frames
+from client.window import Action, Window
 from server.requests import ClientLatencyRequest
+from tests.answering import QuietHandler, answering
 from tests.conftest import FRAMES, HEIGHT, WIDTH
-from tests.moving import picture
 from tests.streaming import planes
 
 MakeClip = Callable[..., Path]
@@ -52,11 +46,6 @@ def play(model_file: Callable[..., Path], capsys: pytest.CaptureFixture[str]) ->
     return run
 
 
-def y4m_frames(path: Path) -> list[Frame]:
-    with av.open(str(path)) as container:
-        return [from_av_frame(frame) for frame in container.decode(video=0)]
-
-
 def test_a_file_into_y4m(play: Play, make_clip: MakeClip, model_file: Callable[..., Path], tmp_path: Path) -> None:
     clip, out = make_clip(), tmp_path / "out.y4m"
     status, said, errors = play(clip, "--sink", out, "--json")
@@ -66,7 +55,7 @@ def test_a_file_into_y4m(play: Play, make_clip: MakeClip, model_file: Callable[.
     assert record["sizes"] == [[WIDTH, HEIGHT]] and record["reception"] is None and record["deadlines_kept"] == 1.0
     upscaler = OnnxUpscaler(model_file())
     state = upscaler.initial_state(HEIGHT, WIDTH)
-    for frame, kept in zip(read_frames(clip), y4m_frames(out), strict=True):
+    for frame, kept in zip(read_frames(clip), read_frames(out), strict=True):
         want, state = upscaler.step(frame, state)
         assert planes(want) == planes(kept)
     with av.open(str(out)) as container:
@@ -74,58 +63,13 @@ def test_a_file_into_y4m(play: Play, make_clip: MakeClip, model_file: Callable[.
     assert not list(tmp_path.glob(".*.part"))
     status, _, errors = play(clip, "--sink", out)
     assert status == 1 and "--force" in errors
-    assert play(clip, "--sink", out, "--force", "--frames", 3)[0] == 0 and len(y4m_frames(out)) == 3
+    assert play(clip, "--sink", out, "--force", "--frames", 3)[0] == 0 and len(list(read_frames(out))) == 3
 
 
 def test_a_display_that_is_neither_twice_nor_three_times_as_large(play: Play, make_clip: MakeClip, tmp_path: Path) -> None:
     out = tmp_path / "out.y4m"
     assert play(make_clip(), "--sink", out, "--display", "160x120", "--frames", 2)[0] == 0
-    assert {(frame.width, frame.height) for frame in y4m_frames(out)} == {(160, 120)}
-
-
-@pytest.mark.parametrize(
-    "tags", [ColourTags(1, 1, 1, 1), ColourTags(2, 1, 1, 1), ColourTags(0, 2, 2, 2)], ids=["limited", "full", "unsaid"]
-)
-def test_resizing_changes_no_colour(tags: ColourTags) -> None:
-    """A flat picture of any code value stays that, whatever its tags say; a ramp stays within a code value of itself."""
-    resizer = Resizer(72, 48)
-    for value in (0, 16, 100, 235, 255):
-        flat = Frame(
-            *(np.full(shape, value, np.uint8) for shape in ((32, 48), (16, 24), (16, 24))), colour=tags, pts=7, time_base=Fraction(1, 9)
-        )
-        resized = resizer.resize(flat)
-        assert all((plane == value).all() for plane in (resized.y, resized.u, resized.v))
-        assert (resized.width, resized.height, resized.colour, resized.pts, resized.time_base) == (72, 48, tags, 7, flat.time_base)
-    ramp = np.tile((40 + 2 * np.arange(48)).astype(np.uint8), (32, 1))
-    resized = resizer.resize(Frame(ramp, ramp[:16, :24].copy(), ramp[:16, :24].copy(), colour=tags))
-    want = 40 + 2 * ((np.arange(72) + 0.5) / 1.5 - 0.5)
-    assert np.abs(resized.y[:, 4:-4] - want[4:-4]).max() <= 1
-    same = picture(0, 48, 72)
-    assert resizer.resize(same) is same
-
-
-def test_y4m_is_whole_or_not_at_all(tmp_path: Path) -> None:
-    path = tmp_path / "out.y4m"
-    with pytest.raises(ZeroDivisionError), Y4mSink(path) as sink:
-        sink.write(picture(0))
-        raise ZeroDivisionError
-    assert list(tmp_path.iterdir()) == []
-    with Y4mSink(path):
-        pass  # nothing was shown: no file
-    assert list(tmp_path.iterdir()) == []
-    with Y4mSink(path) as sink:
-        sink.write(picture(0, 32, 48))
-        sink.write(picture(1, 64, 96))  # of another size
-        sink.period_ns = 1_000_000_000 * 1001 // 60000
-    with av.open(str(path)) as container:
-        assert container.streams.video[0].average_rate == Fraction(60000, 1001)
-    assert [(frame.width, frame.height) for frame in y4m_frames(path)] == [(48, 32)] * 2
-    for full, said in ((2, 2), (1, 1)):
-        with Y4mSink(path, force=True) as sink:
-            sink.write(Frame(*(np.full(s, 200, np.uint8) for s in ((4, 6), (2, 3), (2, 3))), colour=ColourTags(range=full)))
-        assert y4m_frames(path)[0].colour.range == said
-    with pytest.raises(OutputError, match="does not exist"):
-        Y4mSink(tmp_path / "no" / "out.y4m")
+    assert {(frame.width, frame.height) for frame in read_frames(out)} == {(160, 120)}
 
 
 @pytest.mark.parametrize(
@@ -178,45 +122,6 @@ def test_files_that_are_none(play: Play, tmp_path: Path, name: str, content: byt
     assert status == 1 and out == "" and sentence in errors and len(errors.splitlines()) == 1
 
 
-def test_a_playlist_behind_a_url_names_no_file(make_clip: MakeClip, tmp_path: Path) -> None:
-    """Served over HTTP: what it names is not opened; a video is."""
-    clip = make_clip()
-    (tmp_path / "list.m3u8").write_text(f"#EXTM3U\n#EXTINF:1,\nfile://{clip}\n#EXT-X-ENDLIST\n")
-
-    class Serve(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            content = (tmp_path / self.path.strip("/")).read_bytes()
-            self.send_response(200)
-            self.send_header("Content-Length", str(len(content)))
-            self.end_headers()
-            self.wfile.write(content)
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    with serving(Serve) as address:
-        with (
-            open_source(f"{address}/list.m3u8", until_bye=True, tell=lambda *_: None) as source,
-            pytest.raises(InputError, match="cannot be"),
-        ):
-            list(source.frames(lambda: None))
-        with open_source(f"{address}/{clip.name}", until_bye=False, tell=lambda *_: None) as source:
-            frames = [item.frame for item in source.frames(lambda: None)]
-    assert [planes(frame) for frame in frames] == [planes(frame) for frame in read_frames(clip)] and source.reception is None
-
-
-@contextmanager
-def serving(handler: type[BaseHTTPRequestHandler]) -> Iterator[str]:
-    with HTTPServer(("127.0.0.1", 0), handler) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{server.server_port}"
-        finally:
-            server.shutdown()
-            thread.join()
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -263,10 +168,10 @@ def test_a_signal_ends_with_the_summary(make_clip: MakeClip, model_file: Callabl
             process.kill()
     assert process.returncode == 128 + signum and "Traceback" not in errors
     record = json.loads(said)
-    assert record["ended"] in ("interrupted", "told to end") and len(y4m_frames(out)) == record["frames"]["shown"] > 0
+    assert record["ended"] in ("interrupted", "told to end") and len(list(read_frames(out))) == record["frames"]["shown"] > 0
 
 
-class Collects(BaseHTTPRequestHandler):
+class Collects(QuietHandler):
     """A service that takes summaries at PATH, redirects from /moved and refuses elsewhere."""
 
     taken: list[tuple[str, dict[str, str], bytes]]
@@ -282,14 +187,11 @@ class Collects(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(answer)
 
-    def log_message(self, *_: object) -> None:
-        pass
-
 
 def test_a_summary_is_posted_as_the_service_takes_it(play: Play, make_clip: MakeClip, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GAMESR_API_KEY", "a key of many letters")
     Collects.taken = []
-    with serving(Collects) as address:
+    with answering(Collects) as address:
         status, out, errors = play(make_clip(), "--post", address)
         assert status == 0, errors
         ((path, headers, body),) = Collects.taken
@@ -306,13 +208,9 @@ def test_a_summary_is_posted_as_the_service_takes_it(play: Play, make_clip: Make
             post_summary(url, {})
 
 
+@pytest.mark.usefixtures("no_screen")
 def test_a_window_is_a_sink_like_another(play: Play, make_clip: MakeClip, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keys: the overlay, the wipe with bicubic, and the end."""
-    pytest.importorskip("sdl2")
-    from client import window
-    from client.window import Action, Window
-
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     pressed = [[], [Action.OVERLAY], [], [Action.WIPE], [], [], [Action.WIPE], [], [Action.QUIT]]
     seen: list[tuple[tuple[int, int], bool, int]] = []
 
@@ -320,8 +218,8 @@ def test_a_window_is_a_sink_like_another(play: Play, make_clip: MakeClip, monkey
         assert left is None or left.y.shape == shown.y.shape
         seen.append((shown.y.shape, left is not None, len(overlay)))
 
-    monkeypatch.setattr(window.Window, "present", present)
-    monkeypatch.setattr(window.Window, "actions", lambda self: pressed.pop(0) if pressed and len(seen) > 9 - len(pressed) else [])
+    monkeypatch.setattr(Window, "present", present)
+    monkeypatch.setattr(Window, "actions", lambda self: pressed.pop(0) if pressed and len(seen) > 9 - len(pressed) else [])
     status, out, errors = play(make_clip(frames=40), "--sink", "window", "--json")
     assert status == 0, errors
     assert json.loads(out)["ended"] == "the window was closed"
@@ -329,16 +227,7 @@ def test_a_window_is_a_sink_like_another(play: Play, make_clip: MakeClip, monkey
     assert {wiped for _, wiped, _ in seen} == {False, True} and not seen[-1][1] and seen[0][2] == 0 and seen[-1][2] >= 6
 
 
-def test_urls_are_shown_without_secrets() -> None:
-    assert shown_url("rtsp://me:secret@example.org:8554/game?token=x#y") == "rtsp://example.org:8554/game"
-    for password in ("sec/ret", "sec?ret", "sec#ret"):  # each has to be quoted, and is often not
-        assert "sec" not in shown_url(f"rtsp://me:{password}@example.org/game") and "ret" not in shown_url(
-            f"rtsp://me:{password}@example.org"
-        )
-
-
 def test_the_windows_title_holds_no_password(play: Play, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("sdl2")
     titles = []
 
     def window(title: str, *, fullscreen: bool) -> None:

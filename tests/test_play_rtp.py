@@ -22,8 +22,8 @@ from client.upscaler import OnnxUpscaler
 from client.video import read_frames
 from tests.conftest import FRAMES, HEIGHT, WIDTH
 from tests.lossy import LossyProxy, Weather
+from tests.playing import LONG_NS, Kept, Told
 from tests.streaming import CALM, planes
-from tests.test_player import LONG_NS, Kept, Told
 
 MakeClip = Callable[..., Path]
 LONG_S = 30.0

@@ -1,4 +1,4 @@
-"""What FFmpeg opens, when it falls silent, breaks off, or comes faster than it is taken."""
+"""What FFmpeg opens: what of a URL is followed and shown, when it falls silent, breaks off, or comes faster than it is taken."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ import pytest
 
 from client import play_url
 from client.errors import InputError
-from client.play_source import Arrived, open_source
+from client.play_source import Arrived, open_source, shown_url
 from client.video import VideoSource, read_frames
+from tests.answering import QuietHandler, answering
+from tests.playing import Told
 from tests.streaming import planes
-from tests.test_player import Told
 
 MakeClip = Callable[..., Path]
 LONG_S = 60.0
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(play_url, "_READ_S", 0.5)
     monkeypatch.setattr(play_url, "_RETRY_S", 0.05)
@@ -69,6 +70,7 @@ def waiting_at_most() -> Callable[[], None]:
     return idle
 
 
+@pytest.mark.usefixtures("impatient")
 def test_silence_is_given_up_and_it_is_opened_again(make_clip: MakeClip) -> None:
     clip, told, items, again = make_clip("clip.ts"), Told(), list[Arrived](), list[Arrived]()
     want = [planes(frame) for frame in read_frames(clip)]
@@ -96,6 +98,7 @@ def test_what_is_no_video_is_refused(content: bytes, monkeypatch: pytest.MonkeyP
         list(source.frames(waiting_at_most()))
 
 
+@pytest.mark.usefixtures("impatient")
 def test_silence_from_the_beginning_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(play_url, "_OPEN_S", 0.3)
     refused = pytest.raises(InputError, match="nothing came")
@@ -119,3 +122,35 @@ def test_who_takes_too_slowly_loses_and_knows_it(make_clip: MakeClip, monkeypatc
         reader._ended = True
         rest = list(frames)
     assert told.kinds() == ["overflow"] and 0 < len(rest) <= 8 and all(item.frame.damaged for item in rest)
+
+
+def test_a_playlist_behind_a_url_names_no_file(make_clip: MakeClip, tmp_path: Path) -> None:
+    """Served over HTTP: what it names is not opened; a video is."""
+    clip = make_clip()
+    (tmp_path / "list.m3u8").write_text(f"#EXTM3U\n#EXTINF:1,\nfile://{clip}\n#EXT-X-ENDLIST\n")
+
+    class Serve(QuietHandler):
+        def do_GET(self) -> None:
+            content = (tmp_path / self.path.strip("/")).read_bytes()
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
+
+    with answering(Serve) as address:
+        with (
+            open_source(f"{address}/list.m3u8", until_bye=True, tell=lambda *_: None) as source,
+            pytest.raises(InputError, match="cannot be"),
+        ):
+            list(source.frames(lambda: None))
+        with open_source(f"{address}/{clip.name}", until_bye=False, tell=lambda *_: None) as source:
+            frames = [item.frame for item in source.frames(lambda: None)]
+    assert [planes(frame) for frame in frames] == [planes(frame) for frame in read_frames(clip)] and source.reception is None
+
+
+def test_urls_are_shown_without_secrets() -> None:
+    assert shown_url("rtsp://me:secret@example.org:8554/game?token=x#y") == "rtsp://example.org:8554/game"
+    for password in ("sec/ret", "sec?ret", "sec#ret"):  # each has to be quoted, and is often not
+        assert "sec" not in shown_url(f"rtsp://me:{password}@example.org/game") and "ret" not in shown_url(
+            f"rtsp://me:{password}@example.org"
+        )

@@ -24,10 +24,10 @@ from client.sink import NullSink
 from client.tiers import TieredUpscaler
 from client.upscaler import OnnxUpscaler, State
 from tests.moving import picture
+from tests.playing import LONG_NS, Kept, Told
 from tests.streaming import planes
 
 ModelFile = Callable[..., Path]
-LONG_NS = 100_000_000_000  # no frame misses that
 FPS = 60
 
 
@@ -61,27 +61,6 @@ class Script:
             yield Arrived(timed, now_ns, now_ns, at_ns, at_ns, at_ns, None)
         for _ in range(self._idles):
             idle()
-
-
-class Kept:
-    """A sink that keeps what it is given."""
-
-    def __init__(self) -> None:
-        self.pictures: list[Frame] = []
-
-    def write(self, frame: Frame) -> None:
-        self.pictures.append(frame)
-
-
-class Told:
-    def __init__(self) -> None:
-        self.said: list[tuple[str, str]] = []
-
-    def __call__(self, kind: str, sentence: str) -> None:
-        self.said.append((kind, sentence))
-
-    def kinds(self) -> list[str]:
-        return [kind for kind, _ in self.said]
 
 
 def moving(count: int, height: int = 32, width: int = 48) -> list[Frame]:

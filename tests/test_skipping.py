@@ -19,10 +19,11 @@ from client.pipeline import Restart, upscale_stream
 from client.quality import squared_error
 from client.sink import NullSink
 from client.skipping import SETTLING_FRAMES, SkippingState, SkippingUpscaler
-from client.upscaler import OnnxUpscaler, State
+from client.upscaler import OnnxUpscaler
 from client.video import Decoded
 from model.export import export_network
 from tests.networks import random_network
+from tests.stepping import Spy, same, whole
 
 ModelFile = Callable[..., Path]
 HEIGHT, WIDTH = 200, 264  # 7 x 9 tiles, the last ones cut off
@@ -42,26 +43,6 @@ def changed(frame: Frame, top: int, left: int, height: int, width: int, by: int 
     for plane in (u, v):
         plane[top // 2 : (top + height) // 2, left // 2 : (left + width) // 2] += by
     return replace(frame, y=y, u=u, v=v)
-
-
-def same(a: Frame, b: Frame) -> bool:
-    return all(np.array_equal(p, q) for p, q in zip((a.y, a.u, a.v), (b.y, b.u, b.v), strict=True))
-
-
-class Spy(OnnxUpscaler):
-    """Writes down the size of every frame or window that goes through the session."""
-
-    def __init__(self, model: Path) -> None:
-        super().__init__(model, threads=1)
-        self.sizes: list[tuple[int, int]] = []
-
-    def step(self, frame: Frame, state: State) -> tuple[Frame, State]:
-        self.sizes.append((frame.height, frame.width))
-        return super().step(frame, state)
-
-    def taken(self) -> list[tuple[int, int]]:
-        sizes, self.sizes = self.sizes, []
-        return sizes
 
 
 @pytest.fixture(scope="module")
@@ -89,10 +70,6 @@ def through(upscaler: SkippingUpscaler, frames: list[Frame], state: SkippingStat
     for frame in frames:
         picture, state = upscaler.step(frame, state)
         yield picture, state
-
-
-def whole(upscaler: OnnxUpscaler, frame: Frame) -> Frame:
-    return upscaler.step(frame, upscaler.initial_state(frame.height, frame.width))[0]
 
 
 EXACT = ["bicubic_x2", "bicubic_x3", "lanczos_x2", "lanczos_x3", "live_x2"]
