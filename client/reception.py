@@ -9,7 +9,7 @@ from aiortc.rtp import RtcpByePacket, RtpPacket, is_rtcp
 
 from client.access_unit import AccessUnit, Assembler
 from client.loss import LossRule
-from client.reorder import ReorderBuffer
+from client.reorder import WAIT_NS, ReorderBuffer
 from client.rtp import PAYLOAD_TYPE, SEND_TIME_ID, extensions_map, keyframe_request, parse_rtcp, parse_rtp, unwrap
 
 Address = tuple[str, int]
@@ -97,8 +97,7 @@ class Reception:
     def take(self, datagram: bytes, address: Address, now_ns: int) -> list[AccessUnit]:
         """What a datagram completes; anything may be in it."""
         if is_rtcp(datagram):
-            self._take_rtcp(datagram, address)
-            return []
+            return self._take_rtcp(datagram, address, now_ns)
         packet = parse_rtp(datagram, self._extensions)
         if packet is None or packet.payload_type != self._payload_type:
             self._counts.ignored += 1
@@ -140,11 +139,15 @@ class Reception:
             return False
         return not self._rule.heals or now_ns - self._damaged_since_ns > HEALING_NS
 
-    def _take_rtcp(self, datagram: bytes, address: Address) -> None:
+    def _take_rtcp(self, datagram: bytes, address: Address, now_ns: int) -> list[AccessUnit]:
         if address != self.sender:
             self._counts.ignored += 1
         elif any(isinstance(packet, RtcpByePacket) and self._ssrc in packet.sources for packet in parse_rtcp(datagram)):
             self.ended = True
+            # Nothing follows that could fill a gap, or tell that the last picture's end is missing.
+            units = self._assemble(self._order.release(now_ns + WAIT_NS), now_ns)
+            return units + [self._judged(unit, now_ns) for unit in self._assembler.end()]
+        return []
 
     def _accept(self, number: int, packet: RtpPacket, size: int, now_ns: int) -> list[AccessUnit]:
         self._counts.packets += 1
@@ -176,15 +179,17 @@ class Reception:
         return units + self._accept(first + 1, packet, size, now_ns)
 
     def _assemble(self, passed: list[tuple[int, tuple[RtpPacket, int]]], now_ns: int) -> list[AccessUnit]:
-        units = []
+        units: list[AccessUnit] = []
         for missing, (packet, arrived_ns) in passed:
-            for unit in self._assembler.add(packet, arrived_ns, missing):
-                damaged = self._rule.admit(unit)
-                units.append(replace(unit, damaged=damaged))
-                self._counts.units += 1
-                self._counts.damaged_units += damaged
-                if not damaged:
-                    self._damaged_since_ns = None
-                elif self._damaged_since_ns is None:
-                    self._damaged_since_ns = now_ns
+            units += [self._judged(unit, now_ns) for unit in self._assembler.add(packet, arrived_ns, missing)]
         return units
+
+    def _judged(self, unit: AccessUnit, now_ns: int) -> AccessUnit:
+        damaged = self._rule.admit(unit)
+        self._counts.units += 1
+        self._counts.damaged_units += damaged
+        if not damaged:
+            self._damaged_since_ns = None
+        elif self._damaged_since_ns is None:
+            self._damaged_since_ns = now_ns
+        return replace(unit, damaged=damaged)

@@ -202,6 +202,20 @@ def test_goodbye_is_believed_of_the_sender_alone() -> None:
     assert reception.ended
 
 
+@pytest.mark.parametrize("gone", [1, 2], ids=["in-the-middle", "with-the-marker"])
+def test_what_waits_at_the_goodbye_is_not_lost(gone: int) -> None:
+    """Nothing can fill a gap any more, and a picture whose last packet is missing is damaged."""
+    stream, reception = RtpStream(), Reception(wall_offset_ns=0)
+    sent = [packets(stream, number, 5 if number == 0 else 1) for number in range(3)]
+    del sent[2][gone]
+    units = [whole for datagrams in sent for datagram in datagrams for whole in reception.take(datagram, HERE, 0)]
+    assert len(units) == 2 and not reception.ended
+    last = reception.take(stream.goodbye(), HERE, 0)
+    assert [(whole.timestamp, whole.packets, whole.whole, whole.damaged) for whole in last] == [(3000, 2, False, True)]
+    assert reception.ended and not any(whole.damaged for whole in units) and reception.counts.units == 3
+    assert reception.take(stream.goodbye(), HERE, 0) == []
+
+
 @given(st.integers(0, 65_535), st.booleans(), st.booleans(), st.binary(max_size=300).filter(lambda b: b[:1] != b"\6"))
 def test_recovery_points_are_read_behind_any_other_message(count: int, exact: bool, broken: bool, other: bytes) -> None:
     code = f"{count + 1:b}"
