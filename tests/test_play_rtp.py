@@ -15,7 +15,7 @@ from client.play_rtp import RtpSource
 from client.play_source import FileSource, open_source
 from client.player import Player
 from client.sdp import LOOPBACK, Session, write_sdp
-from client.sender import RtpSender, stream
+from client.sender import RtpSender, Unit, stream
 from client.stream_source import EncodedFile, EncodedLive
 from client.tiers import TieredUpscaler
 from client.upscaler import OnnxUpscaler
@@ -24,6 +24,7 @@ from tests.conftest import FRAMES, HEIGHT, WIDTH
 from tests.lossy import LossyProxy, Weather
 from tests.playing import LONG_NS, Kept, Told
 from tests.streaming import CALM, planes
+from tests.test_rtp import unit
 
 MakeClip = Callable[..., Path]
 LONG_S = 30.0
@@ -149,6 +150,17 @@ def test_a_start_without_an_idr_waits_for_one_and_says_so(make_clip: MakeClip, l
     assert "no_key_frame" in playing.told.kinds() and player.tally.shown == 8
     want = [planes(frame) for frame in read_frames(clip)][6:]
     assert len(want) == 8 and player.tally.damaged == 0
+
+
+def test_a_key_frame_that_nobody_has_looked_at_is_not_missed() -> None:
+    told = Told()
+    with RtpSource(Session((LOOPBACK, 0)), until_bye=True, tell=told) as source, RtpSender(*source._receiver.address) as sender:
+        sender.send(Unit(unit(0, 5), 0))
+        end = time.monotonic() + LONG_S
+        while not source.waiting() and time.monotonic() < end:
+            time.sleep(0.005)
+        source._watch()  # as while nothing comes, which may end just then
+    assert source.waiting() == 1 and told.kinds() == ["sender"]
 
 
 def test_bursts_of_loss_end_by_themselves(make_clip: MakeClip, listening: Callable[..., Playing]) -> None:
