@@ -17,9 +17,11 @@ from client.errors import InputError
 from client.loss import LossRule
 from client.receiver import RtpReceiver
 from client.rtp import CLOCK_HZ
-from client.video import MAX_SIDE, Decoded, from_av_frame
+from client.upscaler import MAX_OUTPUT_PIXELS
+from client.video import Decoded, from_av_frame
 
 _TIME_BASE = Fraction(1, CLOCK_HZ)
+MAX_PIXELS = MAX_OUTPUT_PIXELS // 4  # no scale is smaller than 2: what is larger could not be shown
 _UNITS_KEPT = 32  # twice what H.264 may reorder
 _IDLE_S = 0.01
 
@@ -84,7 +86,9 @@ class LiveDecoder:
         try:
             return [received for picture in self._context.decode(packet) if (received := self._receive(picture, packet_ns))]
         except (av.FFmpegError, InputError) as error:
-            self._distrust(error)
+            width, height = self._context.width, self._context.height
+            too_large = f"pictures of {width}x{height} are larger than can be upscaled"  # libavcodec just calls them invalid
+            self._distrust(too_large if width * height > MAX_PIXELS else str(error))
             return []
 
     def _receive(self, picture: av.VideoFrame, packet_ns: int) -> Received | None:
@@ -102,9 +106,9 @@ class LiveDecoder:
             self._rule.distrust()
         return Received(from_av_frame(picture, damaged=damaged), packet_ns, decoded_ns, unit)
 
-    def _distrust(self, error: Exception) -> None:
+    def _distrust(self, reason: str) -> None:
         self.decode_errors += 1
-        self.refusal = str(error)
+        self.refusal = reason
         self._rule.distrust()
 
 
@@ -133,5 +137,5 @@ def _open_decoder() -> VideoCodecContext:
     assert isinstance(context, VideoCodecContext)
     context.thread_count = 1
     context.flags |= Flags.low_delay | Flags.output_corrupt
-    context.options = {"max_pixels": str(MAX_SIDE * MAX_SIDE)}
+    context.options = {"max_pixels": str(MAX_PIXELS)}
     return context
