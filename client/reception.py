@@ -36,6 +36,12 @@ class ReceptionCounts:
     overflowed_units: int = 0
     senders: int = 0  # more than one: it was started again, or another took its place
     keyframe_requests: int = 0
+    span_ns: int = 0  # from the first packet to the newest
+
+    @property
+    def kbps(self) -> float:
+        """RTP headers included, those of UDP and IP not."""
+        return self.bytes * 8e6 / max(1, self.span_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +76,7 @@ class Reception:
         self.sender: Address | None = None
         self.ended = False  # the sender said goodbye
         self.heard_ns = 0  # when the sender's newest packet came
+        self._begun_ns = 0  # when the first packet of all came
         self._payload_type, self._extensions = payload_type, extensions_map(send_time_id)
         self._own_ssrc = secrets.randbits(32)
         self._ssrc: int | None = None
@@ -150,8 +157,11 @@ class Reception:
         return []
 
     def _accept(self, number: int, packet: RtpPacket, size: int, now_ns: int) -> list[AccessUnit]:
+        if not self._counts.packets:
+            self._begun_ns = now_ns
         self._counts.packets += 1
         self._counts.bytes += size
+        self._counts.span_ns = now_ns - self._begun_ns
         self.heard_ns = now_ns
         self._newest = max(self._newest, number)
         self._candidate = None

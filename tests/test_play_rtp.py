@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from client.cloud import NetworkSettings
 from client.play_rtp import RtpSource
 from client.play_source import FileSource, open_source
 from client.player import Player
+from client.reception import ReceptionCounts
 from client.sdp import LOOPBACK, Session, write_sdp
 from client.sender import RtpSender, Unit, stream
 from client.stream_source import EncodedFile, EncodedLive
@@ -102,6 +104,8 @@ def test_a_stream_is_shown_as_the_upscaler_makes_it(
     parts = sum(stages[stage] for stage in ("assemble", "queue", "decode", "upscale", "present"))
     assert (parts == stages["total"]).all()  # no time is in no stage
     assert "sent" in summary.text() and str(FRAMES) in summary.text()
+    longer = ReceptionCounts(packets=900, bytes=1_000_000, span_ns=2_000_000_000)  # than pictures were shown
+    assert " 4000 kbit/s, 900 packets" in replace(summary, reception=longer).text()
 
 
 def test_it_goes_on_after_a_goodbye_and_a_restart(make_clip: MakeClip, listening: Callable[..., Playing]) -> None:

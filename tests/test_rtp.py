@@ -191,6 +191,17 @@ def test_requests_are_few_and_go_to_the_stream() -> None:
     assert all(asks_for_keyframe(feedback, stream.ssrc) and not asks_for_keyframe(feedback, stream.ssrc ^ 1) for _, feedback in requests)
 
 
+def test_the_bitrate_is_that_of_the_time_in_which_packets_came() -> None:
+    """However long nobody sent before, and nothing comes after."""
+    stream, reception, size = RtpStream(), Reception(wall_offset_ns=0), 0
+    for number in range(101):
+        for datagram in packets(stream, number, 5):
+            reception.take(datagram, HERE, 60_000 * MS + number * 16 * MS)
+            size += len(datagram)
+    reception.release(90_000 * MS)
+    assert reception.counts.span_ns == 1600 * MS and reception.counts.kbps == pytest.approx(size * 8 / 1.6 / 1000)
+
+
 def test_goodbye_is_believed_of_the_sender_alone() -> None:
     mine, other, reception = RtpStream(), RtpStream(), Reception(wall_offset_ns=0)
     for datagram in packets(mine, 0, 5):
