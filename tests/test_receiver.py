@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from client.pipeline import Restart, upscale_stream
 from client.receiver import UNITS_QUEUED, RtpReceiver
 from client.reception import Reception
 from client.sdp import LOOPBACK, Session, read_sdp
-from client.sender import RtpSender, RtpStream, Unit, stream
+from client.sender import RtpSender, RtpStream, Sent, Unit, stream
 from client.sink import NullSink
 from client.stream_source import EncodedFile, EncodedLive
 from client.upscaler import OnnxUpscaler
@@ -229,6 +230,28 @@ def test_the_command(make_clip: MakeClip, receiver: RtpReceiver, tmp_path: Path)
     session = read_sdp(sdp.read_text())
     assert session.address == receiver.address and session.parameter_sets and units[0] and session.parameter_sets[5:] in units[0].data
     assert stream_cli.main([*arguments]) == 1  # the description is there already
+
+
+def test_the_command_keeps_nothing_of_what_it_sent(make_clip: MakeClip, capsys: pytest.CaptureFixture[str]) -> None:
+    """With --loop it goes on for days."""
+
+    class Watched(Sent):
+        pass
+
+    def sent(source: object, sender: object) -> Iterator[Sent]:
+        seen = []
+        for number in range(8):
+            done = Watched(1000, 2, 0 if number else 1_000_000_000)
+            seen.append(weakref.ref(done))
+            yield done
+        assert sum(ref() is not None for ref in seen) <= 2  # this one, and the caller's
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("client.sender.stream", sent)
+        assert stream_cli.main([str(make_clip()), "--to", f"{LOOPBACK}:9", "--copy"]) == 0
+    assert (
+        capsys.readouterr().out == "8 pictures in 16 packets, 240 kbit/s on the wire; 1 late by more than 33.3 ms; 0 key frame requests\n"
+    )
 
 
 @pytest.mark.parametrize(
