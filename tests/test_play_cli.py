@@ -227,6 +227,17 @@ def test_a_window_is_a_sink_like_another(play: Play, make_clip: MakeClip, monkey
     assert {wiped for _, wiped, _ in seen} == {False, True} and not seen[-1][1] and seen[0][2] == 0 and seen[-1][2] >= 6
 
 
+def test_a_summary_goes_to_the_address_and_through_no_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the environment names: a proxy would read the key."""
+    for name in ("no_proxy", "NO_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:1")
+    Collects.taken = []
+    with answering(Collects) as address:
+        post_summary(address, {})
+    assert [path for path, _, _ in Collects.taken] == [PATH]
+
+
 def test_the_windows_title_holds_no_password(play: Play, monkeypatch: pytest.MonkeyPatch) -> None:
     titles = []
 
