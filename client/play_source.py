@@ -21,7 +21,6 @@ from client.video import Decoded, VideoSource
 if TYPE_CHECKING:
     from client.reception import ReceptionCounts
 
-LOOPBACK = "127.0.0.1"
 MAX_SDP_BYTES = 1 << 16
 IDLE_S = 0.01
 _BEHIND_NS = 1_000_000_000  # as much as a receiver's queue holds
@@ -96,7 +95,7 @@ def open_source(text: str, *, until_bye: bool, tell: Tell) -> PlaySource:
 
 def _listen(text: str, until_bye: bool, tell: Tell) -> PlaySource:
     from client.play_rtp import RtpSource  # needs the extra `play`
-    from client.sdp import Session
+    from client.sdp import LOOPBACK, Session
 
     found = _ADDRESS.fullmatch(text)
     if not found or not 0 < int(found["port"]) < 65536:
@@ -137,8 +136,8 @@ def shown_url(url: str) -> str:
 
 
 def shown_source(text: str) -> str:
-    """What `open_source` is given, for people to read."""
-    return shown_url(text) if "://" in text else text
+    """What `open_source` is given, for people to read; ? for the bytes of a file's name that are no UTF-8."""
+    return shown_url(text) if "://" in text else text.encode(errors="replace").decode()
 
 
 class FileSource:
@@ -151,10 +150,10 @@ class FileSource:
 
     def __init__(self, path: Path, *, tell: Tell) -> None:
         self._video = VideoSource(path)
-        self.name = str(path)
+        self.name = shown_source(str(path))
         self.size: tuple[int, int] | None = (self._video.width, self._video.height)
         self._tell = tell
-        self._period_ns = int(1_000_000_000 / self._video.frame_rate)
+        self._period_ns = max(1, int(1_000_000_000 / self._video.frame_rate))  # a header may claim any rate
         self._next_due_ns: int | None = None
 
     def __enter__(self) -> Self:

@@ -251,6 +251,17 @@ def test_the_windows_title_holds_no_password(play: Play, monkeypatch: pytest.Mon
     assert titles == ["gamesr-play rtsp://127.0.0.1:1/x", "gamesr-play 127.0.0.1:5004", "gamesr-play http://..."]
 
 
+@pytest.mark.skipif(sys.platform == "darwin", reason="its file names are UTF-8")
+def test_a_name_that_is_no_utf_8_is_played(make_clip: MakeClip, model_file: Callable[..., Path], tmp_path: Path) -> None:
+    """By a process: capsys would print anything."""
+    clip = make_clip().rename(tmp_path / os.fsdecode(b"clip \xff.mp4"))
+    program = [sys.executable, "-c", "import sys; from client.play_cli import main; sys.exit(main())", str(clip), "--sink", "null"]
+    options = ["--model", str(model_file()), "--threads", "1", "--deadline-ms", "100000"]
+    environment = os.environ | {"PYTHONPATH": str(Path.cwd()), "PYTHONUTF8": "1", "PYTHONIOENCODING": "utf-8"}
+    done = subprocess.run([*program, *options], capture_output=True, text=True, env=environment, timeout=LONG_S)
+    assert done.returncode == 0 and f"{tmp_path}/clip ?.mp4: the stream ended" in done.stdout, done.stderr
+
+
 def test_the_lines_of_the_docs_are_ours() -> None:
     text = (Path(__file__).parent.parent / "docs/play.md").read_text()
     lines = [line.split("#")[0].split() for line in text.splitlines() if line.startswith("    gamesr-play ")]

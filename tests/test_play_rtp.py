@@ -212,6 +212,13 @@ def test_a_file_arrives_in_real_time(make_clip: MakeClip) -> None:
     assert arrivals == sorted(arrivals) and arrivals[-1] - arrivals[0] >= (FRAMES - 4) * 1_000_000_000 // 30
 
 
+def test_a_file_of_any_claimed_rate_is_played(tmp_path: Path) -> None:
+    path = tmp_path / "fast.y4m"
+    path.write_bytes(b"YUV4MPEG2 W32 H32 F2000000000:1 Ip A1:1 C420mpeg2\n" + (b"FRAME\n" + bytes(1536)) * 5)
+    with FileSource(path, tell=Told()) as source:
+        assert [source.waiting() >= 0 for _ in source.frames(lambda: None)] == [True] * 5
+
+
 def test_a_file_that_is_played_too_slowly_waits_and_then_slows_down(make_clip: MakeClip, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many wait as are due; it does not run after a lost second."""
     monkeypatch.setattr("client.play_source._BEHIND_NS", 200_000_000)
