@@ -20,6 +20,7 @@ from client.sender import RtpStream, Unit
 from client.stream_source import EncodedFile
 
 HOST = "127.0.0.1"
+ELSEWHERE = "192.0.2.7"  # what a server behind an address translation calls itself: nobody is to go there
 
 
 @dataclass
@@ -101,7 +102,7 @@ class RtspServer:
             elif "/game" not in url:
                 status = "404 Not Found"
             elif method == "DESCRIBE":
-                body = write_sdp(HOST, 0, self._sets, 30) + "a=control:track1\r\n"
+                body = write_sdp(ELSEWHERE, 0, self._sets, 30) + "a=control:track1\r\n"
                 headers += ["Content-Type: application/sdp", f"Content-Length: {len(body)}"]
             elif method == "SETUP" and self.udp == ("interleaved" in request):
                 status = "461 Unsupported Transport"

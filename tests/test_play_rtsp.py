@@ -70,7 +70,7 @@ def test_a_server_that_has_datagrams_only(clip: Path, want: list[bytes]) -> None
 
 def test_a_server_that_is_killed_and_comes_back(clip: Path, want: list[bytes]) -> None:
     told, again, pictures, end = Told(), list[RtspServer](), list[bytes](), time.monotonic() + LONG_S
-    first = RtspServer(clip, period_s=0.01)
+    first = RtspServer(clip, period_s=0.05)
 
     def idle() -> None:
         assert time.monotonic() < end
