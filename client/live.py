@@ -9,8 +9,8 @@ from fractions import Fraction
 
 import av
 from av.codec.context import Flags
+from av.stream import Stream
 from av.video.codeccontext import VideoCodecContext
-from av.video.stream import VideoStream
 
 from client.access_unit import AccessUnit
 from client.errors import InputError
@@ -81,7 +81,7 @@ class LiveDecoder:
         self.stuck = not frames and self._delay is not None and len(self._waiting) > self._delay + 1
         return frames
 
-    def _frames(self, packet: av.Packet[VideoStream] | None) -> list[Received]:
+    def _frames(self, packet: av.Packet[Stream] | None) -> list[Received]:
         packet_ns = time.perf_counter_ns()
         try:
             return [received for picture in self._context.decode(packet) if (received := self._receive(picture, packet_ns))]
