@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import ssl
 import threading
 import time
@@ -15,11 +16,11 @@ import av
 from av.video.stream import VideoStream
 
 from client.errors import InputError
-from client.play_source import IDLE_S, Arrived, Idle, Tell, shown_url
+from client.play_source import IDLE_S, Arrived, Idle, Paced, Tell, shown_url
 from client.video import CONTAINERS, OpenVideo
 
 PROTOCOLS = ("rtsp", "rtsps", "udp", "tcp", "http", "https")
-_ENDING = ("http", "https")  # a file lies there: its end is the end
+_RECORDED = ("http", "https")  # a file lies there: it comes as fast as it can, and its end is the end
 _BENEATH = "rtp,udp,tcp,tls,http,https,rtsp,rtsps"  # never file, pipe or concat, whatever an answer says
 _TLS = ("https", "rtsps")
 _OPTIONS = {
@@ -38,9 +39,9 @@ _PACKETS_QUEUED = 64
 class UrlSource:
     """A stream that FFmpeg opens, of any codec that it decodes; opened again, every second, when it ended or was silent for 5 s.
 
-    With `until_bye`, and over HTTP, the end is the end. RTSP carries its RTP in the same connection where the server can, else by UDP.
-    Certificates are held against those that Python's ssl trusts (the file in SSL_CERT_FILE). Raises InputError where it cannot be opened
-    the first time.
+    With `until_bye` the end is the end, and over HTTP, where a file is played in real time and nothing of it is lost. RTSP carries its RTP
+    in the same connection where the server can, else by UDP. Certificates are held against those that Python's ssl trusts (the file
+    in SSL_CERT_FILE). Raises InputError where it cannot be opened the first time.
     """
 
     reception = None
@@ -49,7 +50,8 @@ class UrlSource:
         self._url, self._tell = url, tell
         self.name = shown_url(url)
         self.size: tuple[int, int] | None = None
-        self._ends = until_bye or url.partition("://")[0].lower() in _ENDING
+        self._recorded = url.partition("://")[0].lower() in _RECORDED
+        self._ends = until_bye or self._recorded
         self._reader: _Reader | None = None
         self._errors = 0  # of readers before
 
@@ -65,12 +67,12 @@ class UrlSource:
         return self._errors + (0 if self._reader is None else self._reader.decode_errors)
 
     def waiting(self) -> int:
-        return 0 if self._reader is None else len(self._reader.packets)
+        return 0 if self._reader is None else self._reader.waiting()
 
     def frames(self, idle: Idle) -> Iterator[Arrived]:
         begun = gone = False
         while True:
-            self._reader = reader = _Reader(self._url, self.name)
+            self._reader = reader = _Reader(self._url, self.name, recorded=self._recorded)
             reader.start()
             for frame in reader.frames(idle, self._tell):
                 if gone:
@@ -98,15 +100,16 @@ class UrlSource:
 
 
 class _Reader(threading.Thread):
-    """Opens the URL and reads it to its end. Who takes packets too slowly loses them."""
+    """Opens the URL and reads it to its end. Who takes packets too slowly loses them, but a recording waits."""
 
-    def __init__(self, url: str, name: str) -> None:
+    def __init__(self, url: str, name: str, *, recorded: bool) -> None:
         super().__init__(name="url-reader", daemon=True)
         self.packets: deque[tuple[int, av.Packet[VideoStream]]] = deque()
         self.error: InputError | None = None
         self.opened = self.silent = False
-        self._url, self._name = url, name
+        self._url, self._name, self._recorded = url, name, recorded
         self._video: OpenVideo | None = None
+        self._paced: Paced | None = None
         self._changed = threading.Condition()
         self._overflowed = self._closed = self._ended = False
 
@@ -118,15 +121,38 @@ class _Reader(threading.Thread):
         """It ends with the next packet, or when none comes in time; nobody waits for that."""
         with self._changed:
             self._closed = True
+            self._changed.notify_all()
             if self._ended and self._video is not None:
                 self._video.__exit__(None, None, None)
 
+    def waiting(self) -> int:
+        return len(self.packets) if self._paced is None else min(self._paced.waiting(), 1 + len(self.packets))  # one it holds
+
     def frames(self, idle: Idle, tell: Tell) -> Iterator[Arrived]:
+        arrivals = self._arrivals(idle, tell)
+        first = next(arrivals, None)
+        if first is None or self._video is None:
+            return
+        arrivals = itertools.chain([first], arrivals)
+        if self._recorded:
+            self._paced = Paced(self._video, (packet for _, packet in arrivals), tell=tell)
+            yield from self._paced.frames(idle)
+            return
+        for arrived_ns, packet in arrivals:
+            frame = None
+            for frame in self._video.decode(packet):
+                yield Arrived(frame.frame, frame.packet_ns, frame.decoded_ns, arrived_ns, arrived_ns, arrived_ns, None)
+            if frame is None:
+                idle()  # where much comes that cannot be decoded, nobody waits for long
+
+    def _arrivals(self, idle: Idle, tell: Tell) -> Iterator[tuple[int, av.Packet[VideoStream]]]:
+        """Packets with when they were there."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self.packets or self._ended, IDLE_S)
                 ended, overflowed, self._overflowed = self._ended, self._overflowed, False
                 taken = self.packets.popleft() if self.packets else None
+                self._changed.notify_all()
             if overflowed and self._video is not None:
                 self._video.distrust()
                 tell("overflow", "packets waited too long and were thrown away")
@@ -135,10 +161,7 @@ class _Reader(threading.Thread):
                     return
                 idle()
                 continue
-            arrived_ns, packet = taken
-            assert self._video is not None
-            for frame in self._video.decode(packet):
-                yield Arrived(frame.frame, frame.packet_ns, frame.decoded_ns, arrived_ns, arrived_ns, arrived_ns, None)
+            yield taken
 
     def run(self) -> None:
         begin_s = time.monotonic()
@@ -165,14 +188,16 @@ class _Reader(threading.Thread):
             now_s = time.monotonic()
             # After silence FFmpeg gives out what it held, as if that had come, and for each piece would wait anew.
             self.silent = now_s - before_s >= _READ_S
-            before_s = now_s
             self._put(packet)
+            before_s = time.monotonic()
             if self._closed or self.silent:
                 break
 
     def _put(self, packet: av.Packet[VideoStream]) -> None:
         with self._changed:
-            if len(self.packets) >= _PACKETS_QUEUED:
+            if self._recorded:
+                self._changed.wait_for(lambda: len(self.packets) < _PACKETS_QUEUED or self._closed)
+            elif len(self.packets) >= _PACKETS_QUEUED:
                 self.packets.clear()
                 self._overflowed = True
             self.packets.append((time.perf_counter_ns(), packet))
