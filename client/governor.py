@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 START_SHARE = 0.8  # of the limit: what a tier may cost to be begun with, since decoding and presenting take their part
-FIT_SHARE = 0.9  # of the limit: what a better tier may come to, as far as can be told beforehand
+FIT_SHARE = 0.9  # of the deadline: what a better tier may come to, as far as can be told beforehand
+PACE_SHARE = 0.95  # of a frame's period, in the median: a queue makes good for one frame what another took
 SPREAD = 1.1  # a frame's p95 over its median, on a machine that does nothing else
 WINDOW_FRAMES = 60
 MIN_FRAMES = 20  # fewer have no 95th percentile
@@ -31,14 +32,14 @@ class Switch:
 class Governor:
     """Moves between tiers, of which the first is the best, so that frames are presented within `deadline_ns` of their arrival.
 
-    `costs_ns` are medians of what the tiers took for a frame in warm-up, at the stream's size; `deadline_ns` and `period_ns` may be set
+    `costs_ns` are the least that the tiers took for a frame in warm-up, at the stream's size; `deadline_ns` and `period_ns` may be set
     anew at any time. A tier is begun with only if its cost is at most 0.8 of the deadline and of a frame's period.
 
     Down it goes to the best tier that should fit, or to the last: when three frames in a row missed, when three wait, when the p95
     of the last 60 is over the deadline, or when six of the last 600 missed. Up it goes when none of 60 missed and the better tier should
-    come to at most 0.9 of the limit: its warm-up cost, times how much slower than in its own warm-up the present tier runs, and what
-    the frame takes besides. From any switch to one upwards pass 2 s; a tier that does not last 10 s is next tried after twice as long
-    as before, at most after 64 s.
+    fit: its warm-up cost, times how much slower than in its own warm-up the present tier runs, and what the frame takes besides, come to
+    at most 0.9 of the deadline in the 95th percentile and 0.95 of the period in the median. From any switch to one upwards pass 2 s; a
+    tier that does not last 10 s is next tried after twice as long as before, at most after 64 s.
     """
 
     def __init__(self, costs_ns: Sequence[int], *, deadline_ns: int, period_ns: int, now_ns: int) -> None:
@@ -94,7 +95,7 @@ class Governor:
             self._hold_ns[self.tier] = HOLD_NS
         self._not_before_ns[self.tier] = now_ns + self._hold_ns[self.tier]
         below = range(self.tier + 1, len(self._costs_ns))
-        fitting = [tier for tier in below if self._fits(tier, 1.0)] if self._upscale_ns else [self.tier + 1]
+        fitting = [tier for tier in below if self._fits(tier, 1.0, 1.0)] if self._upscale_ns else [self.tier + 1]
         return self._switch(now_ns, fitting[0] if fitting else below[-1], reason)
 
     def _up(self, now_ns: int) -> Switch | None:
@@ -103,17 +104,17 @@ class Governor:
         if any(latency_ns > self.deadline_ns for latency_ns in self._latencies_ns):
             return None
         for tier in range(self.tier):
-            if now_ns >= self._not_before_ns[tier] and self._fits(tier, FIT_SHARE):
+            if now_ns >= self._not_before_ns[tier] and self._fits(tier, FIT_SHARE, PACE_SHARE):
                 return self._switch(now_ns, tier, "the better tier fits the measured load")
         return None
 
-    def _fits(self, tier: int, share: float) -> bool:
-        """Whether frames should be in time with a tier, as slow as the machine is now."""
+    def _fits(self, tier: int, share: float, pace_share: float) -> bool:
+        """Whether frames should be in time with a tier, and none wait for ever longer, as slow as the machine is now."""
         slower = _median(self._upscale_ns) / max(1, self._costs_ns[self.tier])
-        cost_ns = self._costs_ns[tier] * slower * SPREAD
-        late_ns = cost_ns + _p95([before_ns for before_ns, _ in self._besides_ns])
-        busy_ns = cost_ns + _p95([busy_ns for _, busy_ns in self._besides_ns])
-        return late_ns <= share * self.deadline_ns and busy_ns <= share * self.period_ns
+        cost_ns = self._costs_ns[tier] * slower
+        late_ns = SPREAD * cost_ns + _p95([before_ns for before_ns, _ in self._besides_ns])
+        busy_ns = cost_ns + _median([busy_ns for _, busy_ns in self._besides_ns])
+        return late_ns <= share * self.deadline_ns and busy_ns <= pace_share * self.period_ns
 
     def _switch(self, now_ns: int, tier: int, reason: str) -> Switch:
         switch = Switch(now_ns, self.tier, tier, reason)

@@ -129,6 +129,7 @@ class OpenVinoRuntime:
             "INFERENCE_NUM_THREADS": threads,
             "NUM_STREAMS": 1,
             "PERF_COUNT": counting,
+            "ENABLE_CPU_PINNING": False,  # a thread bound to a core waits for whoever computes there, and all others for it
         }
         self._compiled: dict[tuple[tuple[str, tuple[int, ...]], ...], Any] = {}
 
