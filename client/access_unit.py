@@ -117,6 +117,12 @@ class Assembler:
         if packet.marker:
             yield self._finish()
 
+    def end(self) -> Iterator[AccessUnit]:
+        """Nothing follows: a unit under way lacks its end."""
+        if self._unit is not None:
+            self._unit.broken = True
+            yield self._finish()
+
     def _finish(self) -> AccessUnit:
         unit = self._unit
         assert unit is not None

@@ -11,6 +11,7 @@ import numpy as np
 from av.video.codeccontext import VideoCodecContext
 from av.video.frame import PictureType
 
+from client.errors import InputError
 from client.frames import BT709_LIMITED, ColourTags, Frame, Plane
 from client.video import from_av_frame, to_av_frame
 
@@ -50,6 +51,14 @@ def area_downscale(frame: Frame, scale: int) -> Frame:
     return Frame(
         _luma_mean(frame.y, scale), _chroma_mean(frame.u, scale), _chroma_mean(frame.v, scale), frame.pts, frame.time_base, frame.colour
     )
+
+
+def area_scale(name: str, size: tuple[int, int], height: int) -> int:
+    """By which pictures of `size` (width, height) are downscaled to `height`; raises InputError, about `name`, where that is not even."""
+    scale, rest = divmod(size[1], height)
+    if rest or not scale or size[1] % (2 * scale) or size[0] % (2 * scale):
+        raise InputError(f"{name} is {size[0]}x{size[1]}, which cannot be reduced to a height of {height} evenly")
+    return scale
 
 
 def _luma_mean(plane: Plane, scale: int) -> Plane:

@@ -22,7 +22,7 @@ from client.pipeline import Sink
 from client.play_overlay import OverlayLines
 from client.play_post import post_summary
 from client.play_sink import ResizingSink, Y4mSink
-from client.play_source import open_source
+from client.play_source import open_source, shown_source
 from client.play_summary import PlaySummary
 from client.player import Player
 from client.runtime import PROVIDERS
@@ -128,7 +128,7 @@ def play(arguments: argparse.Namespace, asked: Asked) -> PlaySummary:
             from client.play_window import WindowSink  # needs the extra `play`
             from client.window import Window
 
-            shown = stack.enter_context(Window(f"{PROGRAM} {arguments.source}", fullscreen=arguments.fullscreen))
+            shown = stack.enter_context(Window(f"{PROGRAM} {shown_source(arguments.source)}", fullscreen=arguments.fullscreen))
             sink = window = WindowSink(shown, lambda: lines(), provider=arguments.provider, threads=arguments.threads)
         elif arguments.sink != "null":
             sink = file = stack.enter_context(Y4mSink(Path(arguments.sink), force=arguments.force))

@@ -36,7 +36,7 @@ def post_summary(url: str, record: Mapping[str, object]) -> None:
             raise ValueError("it is no http address")
         target = url if urlsplit(url).path.rstrip("/") == PATH else url.rstrip("/") + PATH
         request = urllib.request.Request(target, json.dumps(record).encode(), headers, method="POST")
-        with urllib.request.build_opener(_NoRedirect).open(request, timeout=_TIMEOUT_S) as answer:
+        with urllib.request.build_opener(_NoRedirect, urllib.request.ProxyHandler({})).open(request, timeout=_TIMEOUT_S) as answer:
             answer.read(_ANSWER_BYTES)
     except urllib.error.HTTPError as error:
         with error:

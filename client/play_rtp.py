@@ -30,7 +30,7 @@ class RtpSource:
         self.size: tuple[int, int] | None = None
         self.name = f"{host} port {port}"
         self._senders = self._overflowed = 0
-        self._silent = self._asked = False
+        self._silent = self._without_start = False
         self._refusal: str | None = None
 
     def __enter__(self) -> Self:
@@ -81,12 +81,12 @@ class RtpSource:
         if address is not None and counts.senders > self._senders:
             again = "the sender was started again" if self._senders else "receiving"
             self._tell("sender", f"{again}, from {address[0]} port {address[1]}")
-            self._senders, self._asked = counts.senders, False
+            self._senders = counts.senders
         elif self._silent != (silent_ns > SILENCE_NS):
             self._silent = not self._silent
             self._tell("silence", "nothing has come for a second: waiting" if self._silent else "the sender is heard again")
-        if counts.units and not self._decoder.begun and not self._asked:
-            self._asked = True
+        without_start, self._without_start = self._without_start, self._decoder.without_start
+        if self._without_start and not without_start:
             self._tell("no_key_frame", "the stream began without a key frame: waiting for one, which was asked for")
         if counts.overflowed_units > self._overflowed:
             self._tell("overflow", f"{counts.overflowed_units - self._overflowed} pictures waited too long and were thrown away")

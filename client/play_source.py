@@ -16,12 +16,11 @@ import av
 from av.video.stream import VideoStream
 
 from client.errors import InputError
-from client.video import Decoded, VideoSource
+from client.video import Decoded, OpenVideo, VideoSource
 
 if TYPE_CHECKING:
     from client.reception import ReceptionCounts
 
-LOOPBACK = "127.0.0.1"
 MAX_SDP_BYTES = 1 << 16
 IDLE_S = 0.01
 _BEHIND_NS = 1_000_000_000  # as much as a receiver's queue holds
@@ -84,7 +83,7 @@ def open_source(text: str, *, until_bye: bool, tell: Tell) -> PlaySource:
         try:
             urlsplit(text)
         except ValueError as error:
-            raise InputError(f"{text} is no URL") from error
+            raise InputError(f"{shown_url(text)} is no URL") from error
         return UrlSource(text, until_bye=until_bye, tell=tell)
     if _ADDRESS.fullmatch(text) and not Path(text).exists():
         return _listen(text, until_bye, tell)
@@ -96,7 +95,7 @@ def open_source(text: str, *, until_bye: bool, tell: Tell) -> PlaySource:
 
 def _listen(text: str, until_bye: bool, tell: Tell) -> PlaySource:
     from client.play_rtp import RtpSource  # needs the extra `play`
-    from client.sdp import Session
+    from client.sdp import LOOPBACK, Session
 
     found = _ADDRESS.fullmatch(text)
     if not found or not 0 < int(found["port"]) < 65536:
@@ -122,48 +121,53 @@ def _described(path: Path, until_bye: bool, tell: Tell) -> PlaySource:
 
 
 def shown_url(url: str) -> str:
-    """A URL without name, password and query, for people to read."""
-    parts = urlsplit(url)
-    return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
+    """A URL without name, password and query, for people to read.
+
+    Of what is none, or may have / ? or # in its password, nothing but the scheme.
+    """
+    scheme = url.partition("://")[0]
+    try:
+        parts = urlsplit(url)
+    except ValueError:
+        return f"{scheme}://..."
+    if "@" in parts.path + parts.query + parts.fragment:
+        return f"{scheme}://..."
+    return f"{scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
 
 
-class FileSource:
-    """A video file in real time: each packet arrives when its timestamp says, the first at once. It loses nothing.
+def shown_source(text: str) -> str:
+    """What `open_source` is given, for people to read; ? for the bytes of a file's name that are no UTF-8."""
+    return shown_url(text) if "://" in text else text.encode(errors="replace").decode()
 
-    Where decoding falls behind by more than a second the clock is set back, so that it slows down. Raises InputError.
+
+class Paced:
+    """A recording in real time: of each of its packets, when its timestamp says, the frames; of the first at once. It loses nothing.
+
+    While no packets come the clock stands, and where decoding falls behind by more than a second it is set back, so that it slows down.
     """
 
-    reception = None
-
-    def __init__(self, path: Path, *, tell: Tell) -> None:
-        self._video = VideoSource(path)
-        self.name = str(path)
-        self.size: tuple[int, int] | None = (self._video.width, self._video.height)
-        self._tell = tell
-        self._period_ns = int(1_000_000_000 / self._video.frame_rate)
+    def __init__(self, video: OpenVideo, packets: Iterator[av.Packet[VideoStream]], *, tell: Tell) -> None:
+        self._video, self._packets, self._tell = video, packets, tell
+        self._period_ns = max(1, int(1_000_000_000 / video.frame_rate))  # a header may claim any rate
         self._next_due_ns: int | None = None
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._video.__exit__(kind, error, trace)
-
-    @property
-    def decode_errors(self) -> int:
-        return self._video.decode_errors
-
     def waiting(self) -> int:
+        """How many more are due by now."""
         late_ns = -1 if self._next_due_ns is None else time.perf_counter_ns() - self._next_due_ns
         return 0 if late_ns < 0 else 1 + late_ns // self._period_ns
 
     def frames(self, idle: Idle) -> Iterator[Arrived]:
+        """Each arrives when it is due."""
         timed = self._timed()
         following = next(timed, None)
         begin_ns = time.perf_counter_ns()
         while following is not None:
-            (at_ns, packet), following = following, next(timed, None)
-            due_ns = begin_ns + at_ns
+            at_ns, packet = following
+            asked_ns, due_ns = time.perf_counter_ns(), begin_ns + at_ns
+            following = next(timed, None)
+            starved_ns = max(0, time.perf_counter_ns() - max(asked_ns, due_ns))
+            begin_ns += starved_ns
+            due_ns += starved_ns
             while (left_ns := due_ns - time.perf_counter_ns()) > 0:
                 idle()
                 time.sleep(max(0.0, min((due_ns - time.perf_counter_ns()) / 1e9, IDLE_S)))
@@ -181,7 +185,7 @@ class FileSource:
         period_ns = self._period_ns
         tick_ns = 1_000_000_000 * Fraction(self._video.time_base)
         at_ns, last_dts = -period_ns, None
-        for packet in self._video.packets():
+        for packet in self._packets:
             step_ns = period_ns
             if packet.dts is not None and last_dts is not None:
                 step_ns = int((packet.dts - last_dts) * tick_ns)
@@ -189,3 +193,31 @@ class FileSource:
             at_ns += step_ns if packet.size else 0
             last_dts = packet.dts
             yield max(0, at_ns), packet
+
+
+class FileSource:
+    """A video file in real time. Raises InputError."""
+
+    reception = None
+
+    def __init__(self, path: Path, *, tell: Tell) -> None:
+        self._video = VideoSource(path)
+        self._paced = Paced(self._video, self._video.packets(), tell=tell)
+        self.name = shown_source(str(path))
+        self.size: tuple[int, int] | None = (self._video.width, self._video.height)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._video.__exit__(kind, error, trace)
+
+    @property
+    def decode_errors(self) -> int:
+        return self._video.decode_errors
+
+    def waiting(self) -> int:
+        return self._paced.waiting()
+
+    def frames(self, idle: Idle) -> Iterator[Arrived]:
+        return self._paced.frames(idle)

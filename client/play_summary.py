@@ -101,7 +101,7 @@ class PlaySummary:
             lines.append(f"    at {self._at_s(switch.at_ns):.1f} s {names}: {switch.reason}")
         if self.reception is not None:
             counts = self.reception
-            rate = f"{counts.bytes * 8 / 1000 / max(self._seconds, 1e-3):.0f} kbit/s, " if self._seconds >= 1 else ""
+            rate = f"{counts.kbps:.0f} kbit/s, " if counts.span_ns >= 1_000_000_000 else ""
             lines.append(
                 f"  network  {rate}{counts.packets} packets, {counts.lost} lost, {counts.late} late, {counts.duplicates} twice, "
                 f"{counts.keyframe_requests} key frames asked for, {counts.senders} senders"

@@ -9,7 +9,7 @@ from aiortc.rtp import RtcpByePacket, RtpPacket, is_rtcp
 
 from client.access_unit import AccessUnit, Assembler
 from client.loss import LossRule
-from client.reorder import ReorderBuffer
+from client.reorder import WAIT_NS, ReorderBuffer
 from client.rtp import PAYLOAD_TYPE, SEND_TIME_ID, extensions_map, keyframe_request, parse_rtcp, parse_rtp, unwrap
 
 Address = tuple[str, int]
@@ -36,6 +36,12 @@ class ReceptionCounts:
     overflowed_units: int = 0
     senders: int = 0  # more than one: it was started again, or another took its place
     keyframe_requests: int = 0
+    span_ns: int = 0  # from the first packet to the newest
+
+    @property
+    def kbps(self) -> float:
+        """RTP headers included, those of UDP and IP not."""
+        return self.bytes * 8e6 / max(1, self.span_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +76,7 @@ class Reception:
         self.sender: Address | None = None
         self.ended = False  # the sender said goodbye
         self.heard_ns = 0  # when the sender's newest packet came
+        self._begun_ns = 0  # when the first packet of all came
         self._payload_type, self._extensions = payload_type, extensions_map(send_time_id)
         self._own_ssrc = secrets.randbits(32)
         self._ssrc: int | None = None
@@ -97,8 +104,7 @@ class Reception:
     def take(self, datagram: bytes, address: Address, now_ns: int) -> list[AccessUnit]:
         """What a datagram completes; anything may be in it."""
         if is_rtcp(datagram):
-            self._take_rtcp(datagram, address)
-            return []
+            return self._take_rtcp(datagram, address, now_ns)
         packet = parse_rtp(datagram, self._extensions)
         if packet is None or packet.payload_type != self._payload_type:
             self._counts.ignored += 1
@@ -140,15 +146,22 @@ class Reception:
             return False
         return not self._rule.heals or now_ns - self._damaged_since_ns > HEALING_NS
 
-    def _take_rtcp(self, datagram: bytes, address: Address) -> None:
+    def _take_rtcp(self, datagram: bytes, address: Address, now_ns: int) -> list[AccessUnit]:
         if address != self.sender:
             self._counts.ignored += 1
         elif any(isinstance(packet, RtcpByePacket) and self._ssrc in packet.sources for packet in parse_rtcp(datagram)):
             self.ended = True
+            # Nothing follows that could fill a gap, or tell that the last picture's end is missing.
+            units = self._assemble(self._order.release(now_ns + WAIT_NS), now_ns)
+            return units + [self._judged(unit, now_ns) for unit in self._assembler.end()]
+        return []
 
     def _accept(self, number: int, packet: RtpPacket, size: int, now_ns: int) -> list[AccessUnit]:
+        if not self._counts.packets:
+            self._begun_ns = now_ns
         self._counts.packets += 1
         self._counts.bytes += size
+        self._counts.span_ns = now_ns - self._begun_ns
         self.heard_ns = now_ns
         self._newest = max(self._newest, number)
         self._candidate = None
@@ -176,15 +189,17 @@ class Reception:
         return units + self._accept(first + 1, packet, size, now_ns)
 
     def _assemble(self, passed: list[tuple[int, tuple[RtpPacket, int]]], now_ns: int) -> list[AccessUnit]:
-        units = []
+        units: list[AccessUnit] = []
         for missing, (packet, arrived_ns) in passed:
-            for unit in self._assembler.add(packet, arrived_ns, missing):
-                damaged = self._rule.admit(unit)
-                units.append(replace(unit, damaged=damaged))
-                self._counts.units += 1
-                self._counts.damaged_units += damaged
-                if not damaged:
-                    self._damaged_since_ns = None
-                elif self._damaged_since_ns is None:
-                    self._damaged_since_ns = now_ns
+            units += [self._judged(unit, now_ns) for unit in self._assembler.add(packet, arrived_ns, missing)]
         return units
+
+    def _judged(self, unit: AccessUnit, now_ns: int) -> AccessUnit:
+        damaged = self._rule.admit(unit)
+        self._counts.units += 1
+        self._counts.damaged_units += damaged
+        if not damaged:
+            self._damaged_since_ns = None
+        elif self._damaged_since_ns is None:
+            self._damaged_since_ns = now_ns
+        return replace(unit, damaged=damaged)

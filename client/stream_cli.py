@@ -76,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def send(arguments: argparse.Namespace) -> int:
     """Everything between the arguments and the summary. Raises GamesrError."""
     from client.sdp import write_sdp  # these need the extra `play`
-    from client.sender import RtpSender, Sent, UnitSource, stream
+    from client.sender import RtpSender, UnitSource, stream
     from client.stream_source import EncodedFile, EncodedLive
 
     with VideoSource(arguments.clip) as clip:
@@ -89,21 +89,20 @@ def send(arguments: argparse.Namespace) -> int:
         settings = NetworkSettings(arguments.bitrate or 8000, fps, intra_refresh=arguments.intra_refresh)
         source = EncodedLive(arguments.clip, height, settings, loop=arguments.loop)
     host, port = arguments.to
-    sent: list[Sent] = []
-    status = 0
+    period_ms = 1000 / fps
+    pictures = packets = octets = late = status = 0
     with RtpSender(host, port) as sender:
         if arguments.sdp:
             _write(arguments.sdp, write_sdp(*sender.target, source.parameter_sets(), fps), force=arguments.force)
         try:
             for done in stream(source, sender):
-                sent.append(done)
+                pictures, packets, octets = pictures + 1, packets + done.packets, octets + done.bytes
+                late += done.late_ns / 1e6 > period_ms
         except KeyboardInterrupt:
             status = 130
-    period_ms = 1000 / fps
-    late = sum(done.late_ns / 1e6 > period_ms for done in sent)
-    rate_kbps = sum(done.bytes for done in sent) * 8 / 1000 / max(1, len(sent)) * fps
+    rate_kbps = octets * 8 / 1000 / max(1, pictures) * fps
     print(
-        f"{len(sent)} pictures in {sum(done.packets for done in sent)} packets, {rate_kbps:.0f} kbit/s on the wire; "
+        f"{pictures} pictures in {packets} packets, {rate_kbps:.0f} kbit/s on the wire; "
         f"{late} late by more than {period_ms:.1f} ms; {sender.requests} key frame requests"
         f"{'' if source.answers_requests or not sender.requests else ', not answered: --copy has only those of the file'}",
         flush=True,

@@ -12,7 +12,7 @@ from av.bitstream import BitStreamFilterContext
 from av.video.stream import VideoStream
 
 from client.access_unit import parameter_sets
-from client.cloud import CloudEncoder, CloudSettings, area_downscale
+from client.cloud import CloudEncoder, CloudSettings, area_downscale, area_scale
 from client.errors import InputError
 from client.frames import Frame
 from client.rtp import CLOCK_HZ
@@ -32,9 +32,7 @@ class EncodedLive:
 
     def __init__(self, path: Path, height: int, settings: CloudSettings, *, loop: bool = False) -> None:
         with VideoSource(path) as source:
-            scale, rest = divmod(source.height, height)
-            if rest or not scale or source.height % (2 * scale) or source.width % (2 * scale):
-                raise InputError(f"{path} is {source.width}x{source.height}, which cannot be reduced to a height of {height} evenly")
+            scale = area_scale(source.name, (source.width, source.height), height)
             self.width, self.height = source.width // scale, height
         self._path, self._scale, self._settings = path, scale, settings
         self._encoder = CloudEncoder(settings, self.width, self.height)

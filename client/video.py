@@ -55,6 +55,7 @@ class OpenVideo:
     def __init__(self, name: str, container: InputContainer) -> None:
         self.name = name
         self.decode_errors = 0
+        self.broke_off = False  # reading failed before the end, which is counted as well
         self.display_matrix: tuple[int, ...] | None = None  # known with the first frame
         self._container = container
         try:
@@ -112,6 +113,7 @@ class OpenVideo:
                 packet = next(packets, None)
             except av.FFmpegError:
                 self.decode_errors += 1
+                self.broke_off = True
                 packet = None  # the file cannot be read further: what the decoder still holds comes out
             if packet is None:
                 break

@@ -126,7 +126,7 @@ class Window:
     def _create(self, title: str, flags: int) -> None:
         sdl = self._sdl
         anywhere, kind = sdl.SDL_WINDOWPOS_UNDEFINED, sdl.SDL_WINDOW_HIDDEN | sdl.SDL_WINDOW_RESIZABLE
-        self._window = sdl.SDL_CreateWindow(title.encode(), anywhere, anywhere, 640, 360, kind)
+        self._window = sdl.SDL_CreateWindow(title.encode(errors="replace"), anywhere, anywhere, 640, 360, kind)
         self._renderer = self._window and sdl.SDL_CreateRenderer(self._window, -1, flags)
         if not self._renderer:
             raise OutputError(f"no window can be opened: {sdl_error(sdl)}")

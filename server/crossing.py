@@ -9,7 +9,7 @@ from pathlib import Path
 
 import av
 
-from client.cloud import CloudEncoder, NetworkSettings, area_downscale
+from client.cloud import CloudEncoder, NetworkSettings, area_downscale, area_scale
 from client.errors import InputError
 from client.frames import Frame, Plane
 from client.pipeline import AnyState, Upscaler, upscale_stream
@@ -37,9 +37,7 @@ class Clip:
     def __init__(self, path: Path, height: int, frames: int) -> None:
         with VideoSource(path) as source:
             self.fps = max(1, round(source.frame_rate))
-            self.scale, rest = divmod(source.height, height)
-            if rest or not self.scale or source.height % (2 * self.scale) or source.width % (2 * self.scale):
-                raise InputError(f"{path} is {source.width}x{source.height}, which cannot be reduced to a height of {height} evenly")
+            self.scale = area_scale(source.name, (source.width, source.height), height)
             size = source.height, source.width
         kept = max(1, KEPT_BYTES // (size[0] * size[1] * (2 * self.scale**2 + 3) // (2 * self.scale**2)))
         self.name = path.stem

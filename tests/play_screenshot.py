@@ -6,7 +6,6 @@ gamesr-stream sends the clip that ships here, gamesr-play shows it on a screen t
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 import threading
 import time
@@ -18,12 +17,10 @@ from PIL import Image
 from client.play_cli import main as play
 from client.rgb import RgbPicture
 from tests.headless import Screen, headless_screen
-from tests.serving import ROOT
+from tests.playing import streamed
 
-CLIP = ROOT / "tests/footage/oa_koth1_540p.mp4"
 ADDRESS = "127.0.0.1:5104"
 BEFORE_S, SECONDS = 6.0, 14  # the models are ready by then; the overlay has figures by the end
-STREAM = f"import sys; from client.stream_cli import main; sys.exit(main(['{CLIP}', '--to', '{ADDRESS}', '--copy', '--loop']))"
 
 
 def take(screen: Screen, pictures: list[RgbPicture]) -> None:
@@ -44,13 +41,9 @@ def main() -> None:
     pictures: list[RgbPicture] = []
     with headless_screen(1920, 1080) as screen:
         os.environ["DISPLAY"] = screen.display
-        sender = subprocess.Popen([sys.executable, "-c", STREAM], cwd=ROOT, stdout=subprocess.DEVNULL)
-        try:
+        with streamed(ADDRESS):
             threading.Thread(target=take, args=(screen, pictures), daemon=True).start()
             status = play([ADDRESS, "--seconds", str(SECONDS), *options])
-        finally:
-            sender.terminate()
-            sender.wait()
     Image.fromarray(pictures[0]).save(path, optimize=True)
     print(path, path.stat().st_size)
     sys.exit(status)

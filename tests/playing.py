@@ -1,10 +1,30 @@
-"""What a player is given in the tests: a sink that keeps, an ear for what is told, and a deadline that is far away."""
+"""What a player is given in the tests: a stream, a sink that keeps, an ear for what is told, and a deadline that is far away."""
 
 from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 from client.frames import Frame
 
 LONG_NS = 100_000_000_000  # no frame misses that
+ROOT = Path(__file__).parent.parent
+CLIP = ROOT / "tests/footage/oa_koth1_540p.mp4"
+
+
+@contextmanager
+def streamed(address: str) -> Iterator[None]:
+    """gamesr-stream in a process of its own sends the clip that ships here to HOST:PORT, over and over."""
+    program = "import sys; from client.stream_cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, str(CLIP), "--to", address, "--copy", "--loop"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as sender:
+        try:
+            yield
+        finally:
+            sender.terminate()
 
 
 class Kept:

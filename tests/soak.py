@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import gc
 import multiprocessing
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -19,11 +18,9 @@ from client.player import Player
 from client.runtime import PROVIDERS
 from client.sink import NullSink
 from client.tiers import TieredUpscaler
-from tests.serving import ROOT
+from tests.playing import streamed
 
-CLIP = ROOT / "tests/footage/oa_koth1_540p.mp4"
 ADDRESS = "127.0.0.1:5106"
-STREAM = f"import sys; from client.stream_cli import main; sys.exit(main(['{CLIP}', '--to', '{ADDRESS}', '--copy', '--loop']))"
 
 
 class Minutes:
@@ -84,7 +81,6 @@ def main() -> None:
     arguments = parser.parse_args()
     third_s = arguments.minutes * 20
     thief = multiprocessing.Process(target=steal, args=(third_s, third_s), daemon=True)
-    sender = subprocess.Popen([sys.executable, "-c", STREAM], cwd=ROOT, stdout=subprocess.DEVNULL)
     over = Minutes(arguments.minutes, arguments.row_seconds)
 
     def say(kind: str, sentence: str) -> None:
@@ -93,20 +89,17 @@ def main() -> None:
     deadline_ns = arguments.deadline_ms and int(arguments.deadline_ms * 1e6)
     print("| row | shown | deadlines kept, % | total p50, ms | p95 | p99 | left out | switches | frames by tier | resident MiB |")
     print("|---|---|---|---|---|---|---|---|---|---|")
-    try:
-        with (
-            TieredUpscaler(arguments.tiers.split(","), display_height=None, provider=arguments.provider, threads=None) as tiers,
-            open_source(ADDRESS, until_bye=False, tell=say) as source,
-        ):
-            over.player = Player(source, tiers, NullSink(), tell=say, over=over, deadline_ns=deadline_ns)
-            gc.collect()
-            gc.freeze()
-            if arguments.stolen:
-                thief.start()
-            over.player.play()
-    finally:
-        sender.terminate()
-        sender.wait()
+    with (
+        streamed(ADDRESS),
+        TieredUpscaler(arguments.tiers.split(","), display_height=None, provider=arguments.provider, threads=None) as tiers,
+        open_source(ADDRESS, until_bye=False, tell=say) as source,
+    ):
+        over.player = Player(source, tiers, NullSink(), tell=say, over=over, deadline_ns=deadline_ns)
+        gc.collect()
+        gc.freeze()
+        if arguments.stolen:
+            thief.start()
+        over.player.play()
 
 
 if __name__ == "__main__":

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import av
+import numpy as np
 import pytest
 from av.codec.context import ThreadType
 
 import client.live
 from client.cloud import CloudEncoder, NetworkSettings
 from client.frames import Frame
-from client.live import LiveDecoder
+from client.live import LiveDecoder, Received
 from client.quality import squared_error
 from client.reception import Reception
 from client.rtp import CLOCK_HZ
 from client.sender import RtpStream, Unit
+from client.upscaler import MAX_OUTPUT_PIXELS, plane_shapes
 from client.video import from_av_frame
 from server.link import Weather
 from server.simulation import SENDER
@@ -156,6 +158,20 @@ def test_another_size_in_mid_stream(restart: bool) -> None:
     assert reception.counts.senders == (3 if restart else 1)
     stamps = [item.frame.pts or 0 for item in got]
     assert stamps == sorted(set(stamps))
+
+
+def test_a_picture_too_large_to_be_upscaled_is_refused_and_the_next_is_shown() -> None:
+    """As what cannot be decoded: before there is memory for it, and without an end."""
+    assert 4096 * 4112 * 4 > MAX_OUTPUT_PIXELS >= 4 * client.live.MAX_PIXELS
+    stream, reception, decoder = RtpStream(), Reception(wall_offset_ns=0), LiveDecoder()
+    got: list[Received] = []
+    for index, (width, height) in enumerate([(WIDTH, HEIGHT), (4096, 4112), (WIDTH, HEIGHT)]):
+        grey = (np.full(shape, 128, np.uint8) for shape in plane_shapes(height, width))
+        data = b"".join(CloudEncoder(IDR, width, height).encode(Frame(*grey)))
+        for datagram in stream.datagrams(Unit(data, index * CLOCK_HZ // FPS), lambda: 0):
+            got += [item for unit in reception.take(datagram, SENDER, index) for item in decoder.decode(unit)]
+    assert [(item.frame.width, item.frame.height, item.frame.damaged) for item in got] == [(WIDTH, HEIGHT, False)] * 2
+    assert decoder.decode_errors == 1 and decoder.refusal == "pictures of 4096x4112 are larger than can be upscaled"
 
 
 @MODES

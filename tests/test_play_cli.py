@@ -87,6 +87,8 @@ def test_a_display_that_is_neither_twice_nor_three_times_as_large(play: Play, ma
         ("subfile,,start,0,end,9,,:/etc/passwd", "does not exist"),
         ("crypto+http://127.0.0.1/x", "is not played"),
         ("http://[", "is no URL"),
+        ("rtsp://me:secret@[::1/x", "is no URL"),
+        ("rtsp://me:sec/ret@127.0.0.1/x", "rtsp://... cannot be opened"),
         ("http://127.0.0.1:1/x.mp4", "cannot be opened: Connection refused"),
         ("rtsp://me:secret@127.0.0.1:1/x", "rtsp://127.0.0.1:1/x cannot be opened"),
         ("none.sdp", "cannot be read"),
@@ -223,6 +225,41 @@ def test_a_window_is_a_sink_like_another(play: Play, make_clip: MakeClip, monkey
     assert json.loads(out)["ended"] == "the window was closed"
     assert {size for size, _, _ in seen} == {(2 * HEIGHT, 2 * WIDTH)}
     assert {wiped for _, wiped, _ in seen} == {False, True} and not seen[-1][1] and seen[0][2] == 0 and seen[-1][2] >= 6
+
+
+def test_a_summary_goes_to_the_address_and_through_no_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the environment names: a proxy would read the key."""
+    for name in ("no_proxy", "NO_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:1")
+    Collects.taken = []
+    with answering(Collects) as address:
+        post_summary(address, {})
+    assert [path for path, _, _ in Collects.taken] == [PATH]
+
+
+def test_the_windows_title_holds_no_password(play: Play, monkeypatch: pytest.MonkeyPatch) -> None:
+    titles = []
+
+    def window(title: str, *, fullscreen: bool) -> None:
+        titles.append(title)
+        raise OutputError("no window")
+
+    monkeypatch.setattr("client.window.Window", window)
+    for source in ("rtsp://me:secret@127.0.0.1:1/x", "127.0.0.1:5004", "http://me:secret@["):
+        play(source, "--sink", "window")
+    assert titles == ["gamesr-play rtsp://127.0.0.1:1/x", "gamesr-play 127.0.0.1:5004", "gamesr-play http://..."]
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="its file names are UTF-8")
+def test_a_name_that_is_no_utf_8_is_played(make_clip: MakeClip, model_file: Callable[..., Path], tmp_path: Path) -> None:
+    """By a process: capsys would print anything."""
+    clip = make_clip().rename(tmp_path / os.fsdecode(b"clip \xff.mp4"))
+    program = [sys.executable, "-c", "import sys; from client.play_cli import main; sys.exit(main())", str(clip), "--sink", "null"]
+    options = ["--model", str(model_file()), "--threads", "1", "--deadline-ms", "100000"]
+    environment = os.environ | {"PYTHONPATH": str(Path.cwd()), "PYTHONUTF8": "1", "PYTHONIOENCODING": "utf-8"}
+    done = subprocess.run([*program, *options], capture_output=True, text=True, env=environment, timeout=LONG_S)
+    assert done.returncode == 0 and f"{tmp_path}/clip ?.mp4: the stream ended" in done.stdout, done.stderr
 
 
 def test_the_lines_of_the_docs_are_ours() -> None:

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,8 +15,9 @@ from client.cloud import NetworkSettings
 from client.play_rtp import RtpSource
 from client.play_source import FileSource, open_source
 from client.player import Player
+from client.reception import ReceptionCounts
 from client.sdp import LOOPBACK, Session, write_sdp
-from client.sender import RtpSender, stream
+from client.sender import RtpSender, Unit, stream
 from client.stream_source import EncodedFile, EncodedLive
 from client.tiers import TieredUpscaler
 from client.upscaler import OnnxUpscaler
@@ -24,6 +26,7 @@ from tests.conftest import FRAMES, HEIGHT, WIDTH
 from tests.lossy import LossyProxy, Weather
 from tests.playing import LONG_NS, Kept, Told
 from tests.streaming import CALM, planes
+from tests.test_rtp import unit
 
 MakeClip = Callable[..., Path]
 LONG_S = 30.0
@@ -101,6 +104,8 @@ def test_a_stream_is_shown_as_the_upscaler_makes_it(
     parts = sum(stages[stage] for stage in ("assemble", "queue", "decode", "upscale", "present"))
     assert (parts == stages["total"]).all()  # no time is in no stage
     assert "sent" in summary.text() and str(FRAMES) in summary.text()
+    longer = ReceptionCounts(packets=900, bytes=1_000_000, span_ns=2_000_000_000)  # than pictures were shown
+    assert " 4000 kbit/s, 900 packets" in replace(summary, reception=longer).text()
 
 
 def test_it_goes_on_after_a_goodbye_and_a_restart(make_clip: MakeClip, listening: Callable[..., Playing]) -> None:
@@ -151,6 +156,17 @@ def test_a_start_without_an_idr_waits_for_one_and_says_so(make_clip: MakeClip, l
     assert len(want) == 8 and player.tally.damaged == 0
 
 
+def test_a_key_frame_that_nobody_has_looked_at_is_not_missed() -> None:
+    told = Told()
+    with RtpSource(Session((LOOPBACK, 0)), until_bye=True, tell=told) as source, RtpSender(*source._receiver.address) as sender:
+        sender.send(Unit(unit(0, 5), 0))
+        end = time.monotonic() + LONG_S
+        while not source.waiting() and time.monotonic() < end:
+            time.sleep(0.005)
+        source._watch()  # as while nothing comes, which may end just then
+    assert source.waiting() == 1 and told.kinds() == ["sender"]
+
+
 def test_bursts_of_loss_end_by_themselves(make_clip: MakeClip, listening: Callable[..., Playing]) -> None:
     """Encoder, network that loses in bursts, player: damaged frames are shown and counted, key frames asked for, and it ends clean."""
     clip = make_clip(frames=60, options={"crf": "10", "g": "1"})
@@ -194,6 +210,13 @@ def test_a_file_arrives_in_real_time(make_clip: MakeClip) -> None:
     assert all(item.last_ns <= item.packet_ns <= item.decoded_ns for item in items)
     arrivals = [item.last_ns for item in items]
     assert arrivals == sorted(arrivals) and arrivals[-1] - arrivals[0] >= (FRAMES - 4) * 1_000_000_000 // 30
+
+
+def test_a_file_of_any_claimed_rate_is_played(tmp_path: Path) -> None:
+    path = tmp_path / "fast.y4m"
+    path.write_bytes(b"YUV4MPEG2 W32 H32 F2000000000:1 Ip A1:1 C420mpeg2\n" + (b"FRAME\n" + bytes(1536)) * 5)
+    with FileSource(path, tell=Told()) as source:
+        assert [source.waiting() >= 0 for _ in source.frames(lambda: None)] == [True] * 5
 
 
 def test_a_file_that_is_played_too_slowly_waits_and_then_slows_down(make_clip: MakeClip, monkeypatch: pytest.MonkeyPatch) -> None:

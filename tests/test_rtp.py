@@ -191,6 +191,17 @@ def test_requests_are_few_and_go_to_the_stream() -> None:
     assert all(asks_for_keyframe(feedback, stream.ssrc) and not asks_for_keyframe(feedback, stream.ssrc ^ 1) for _, feedback in requests)
 
 
+def test_the_bitrate_is_that_of_the_time_in_which_packets_came() -> None:
+    """However long nobody sent before, and nothing comes after."""
+    stream, reception, size = RtpStream(), Reception(wall_offset_ns=0), 0
+    for number in range(101):
+        for datagram in packets(stream, number, 5):
+            reception.take(datagram, HERE, 60_000 * MS + number * 16 * MS)
+            size += len(datagram)
+    reception.release(90_000 * MS)
+    assert reception.counts.span_ns == 1600 * MS and reception.counts.kbps == pytest.approx(size * 8 / 1.6 / 1000)
+
+
 def test_goodbye_is_believed_of_the_sender_alone() -> None:
     mine, other, reception = RtpStream(), RtpStream(), Reception(wall_offset_ns=0)
     for datagram in packets(mine, 0, 5):
@@ -200,6 +211,20 @@ def test_goodbye_is_believed_of_the_sender_alone() -> None:
         assert not reception.ended
     reception.take(mine.goodbye(), HERE, 0)
     assert reception.ended
+
+
+@pytest.mark.parametrize("gone", [1, 2], ids=["in-the-middle", "with-the-marker"])
+def test_what_waits_at_the_goodbye_is_not_lost(gone: int) -> None:
+    """Nothing can fill a gap any more, and a picture whose last packet is missing is damaged."""
+    stream, reception = RtpStream(), Reception(wall_offset_ns=0)
+    sent = [packets(stream, number, 5 if number == 0 else 1) for number in range(3)]
+    del sent[2][gone]
+    units = [whole for datagrams in sent for datagram in datagrams for whole in reception.take(datagram, HERE, 0)]
+    assert len(units) == 2 and not reception.ended
+    last = reception.take(stream.goodbye(), HERE, 0)
+    assert [(whole.timestamp, whole.packets, whole.whole, whole.damaged) for whole in last] == [(3000, 2, False, True)]
+    assert reception.ended and not any(whole.damaged for whole in units) and reception.counts.units == 3
+    assert reception.take(stream.goodbye(), HERE, 0) == []
 
 
 @given(st.integers(0, 65_535), st.booleans(), st.booleans(), st.binary(max_size=300).filter(lambda b: b[:1] != b"\6"))

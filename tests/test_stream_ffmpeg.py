@@ -57,6 +57,8 @@ def test_ffmpeg_sends_and_we_receive(ffmpeg: str, make_clip: MakeClip, suffix: s
                 if (unit := receiver.next_unit(0.1)) is not None:
                     frames += decoder.decode(unit)
             process.wait(LONG_S)
+        time.sleep(0.1)
+        assert not receiver.ended  # its goodbye goes to the port above
     assert [planes(item.frame) for item in frames] == [planes(frame) for frame in read_frames(clip)]
     assert not any(item.frame.damaged for item in frames) and all(item.unit.sent_ns is None for item in frames)
     assert receiver.counts.lost == 0

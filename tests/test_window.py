@@ -30,6 +30,12 @@ def test_keys(window: Window) -> None:
     assert window.actions() == []
 
 
+def test_any_title_is_shown(no_screen: None) -> None:
+    """Also a file's name that is no UTF-8."""
+    with Window("clip \udcff.mp4"):
+        assert sdl2.SDL_GetWindowTitle(native()[0]) == b"clip ?.mp4"
+
+
 def test_fullscreen_and_back(window: Window) -> None:
     window.present(noise())
     for key, full in ((sdl2.SDLK_F11, True), (sdl2.SDLK_f, False)):
