@@ -4,22 +4,34 @@ from __future__ import annotations
 
 from typing import Any
 
+from client.errors import ModelError
+from model.lean import ARCHITECTURE, LEAN, Lean, LeanConfig
 from model.network import PRESETS, GameSR, NetworkConfig
 from model.peers import PEERS
 from model.planes import Network
 
-NAMES = (*PRESETS, *PEERS)
+NAMES = (*PRESETS, *LEAN, *PEERS)
 
 
 def network_of_preset(preset: str, scale: int) -> Network:
     """An untrained network; `preset` is one of NAMES."""
+    if preset in LEAN:
+        return described_network({"architecture": ARCHITECTURE, "scale": scale, **LEAN[preset]})
     return described_network({"architecture": preset, "scale": scale} if preset in PEERS else {"scale": scale, **PRESETS[preset]})
 
 
 def described_network(description: dict[str, Any]) -> Network:
-    """An untrained network from its own `description`: that of a peer names its architecture, any other is a `NetworkConfig`."""
-    if "architecture" in description:
-        name, scale = description["architecture"], description["scale"]
-        around, body = PEERS[name]
-        return around(name, body, scale)
-    return GameSR(NetworkConfig(**description))
+    """An untrained network from its own `description`; raises ModelError for one of another version's."""
+    shape = dict(description)
+    architecture = shape.pop("architecture", None)
+    try:
+        if architecture in PEERS:
+            around, body = PEERS[architecture]
+            return around(architecture, body, **shape)
+        if architecture == ARCHITECTURE:
+            return Lean(LeanConfig(**shape))
+        if architecture is None:
+            return GameSR(NetworkConfig(**shape))
+    except TypeError as error:  # an argument that is none
+        raise ModelError(f"this version has no such network: {error}") from error
+    raise ModelError(f"this version has no network of the architecture {architecture}")

@@ -19,7 +19,7 @@ from torch.nn import functional as F
 
 from model.complexity import macs, parameter_count
 from model.fsr1 import SHARPNESS_STOPS, Fsr1
-from model.interpolation import Interpolation, chroma_shift
+from model.interpolation import MIDDLES, Interpolation, chroma_shift
 from model.planes import Network, Planes, State
 from model.reach import network_reach, reach
 
@@ -51,8 +51,9 @@ class Baseline(nn.Module):
         return self.samples(Planes(y.float(), u.float(), v.float()), to_codes)
 
     def samples(self, frame: Planes, finish: Callable[[Tensor], Tensor] = lambda samples: samples) -> Planes:
-        luma = F.pixel_shuffle(finish(self.luma(frame.y)), 2 * self.side)
-        chroma = F.pixel_shuffle(finish(self.chroma(torch.cat((frame.u, frame.v)))), self.side)
+        y, u, v = (plane - middle for plane, middle in zip(frame, MIDDLES, strict=True))
+        luma = F.pixel_shuffle(finish(self.luma(y) + MIDDLES[0]), 2 * self.side)
+        chroma = F.pixel_shuffle(finish(self.chroma(torch.cat((u, v))) + MIDDLES[1]), self.side)
         return Planes(luma, chroma[:1], chroma[1:])
 
 

@@ -13,6 +13,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+# Of Y, U and V: codes about these are interpolated as numbers about zero. What bfloat16 does to a kernel then counts for that much less,
+# and so does what it does to a result that a runtime keeps in it: 128 and more would be rounded to whole numbers, 64 and more to halves.
+MIDDLES = (64.0, 128.0, 128.0)
+
 
 def linear(t: float) -> float:
     return max(0.0, 1.0 - abs(t))

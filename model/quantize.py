@@ -24,11 +24,15 @@ from client.errors import InputError, ModelError
 from client.frames import Frame
 from client.upscaler import OnnxUpscaler, copy_padded, plane_shapes
 from client.video import read_frames
+from model.lean import ARCHITECTURE, CELL
 
 # Not the gates, whose error the state would keep; not what interpolates, which makes the code values themselves; and not a head
 # whose base is apart: a residual of rare large values in 8 bits is what lost most, and such a head is a twentieth of the work.
-QUANTIZED = re.compile(r"network\.(stem|blocks\.\d+\.(conv|0)|head\.features)\.weight")
+QUANTIZED = re.compile(r"network\.(stem|blocks\.\d+(\.conv)?|head\.features)\.weight")
 CALIBRATION_FRAMES = 8
+
+CODES, MIDDLE = "codes_about_zero", 128
+RESIDUAL = "residual"  # what the head makes of the features, in codes
 
 JOINING = ("Relu", "LeakyRelu", "Add")
 
@@ -46,7 +50,7 @@ def quantize(artifact: Path, path: Path, clips: Sequence[Path], *, name: str, fr
     model = onnx.load(artifact)
     if upscaler.spec.precision != "float32":
         raise ModelError(f"{artifact} is {upscaler.spec.precision} already: quantize the float32 artifact")
-    split_merged_head(model.graph, upscaler.spec)
+    split_carried_cells(model.graph, upscaler.spec)
     nodes = _quantized_nodes(model.graph)
     if not nodes:
         raise ModelError(f"{artifact} has no layer that is quantized: it is no GameSR network")
@@ -64,8 +68,10 @@ def quantize(artifact: Path, path: Path, clips: Sequence[Path], *, name: str, fr
                 per_channel=True,
                 activation_type=QuantType.QUInt8,
                 weight_type=QuantType.QInt8,
+                extra_options={"TensorQuantOverrides": exact_codes(model.graph)},
             )
         quantized = onnx.load(whole)
+    leave_float(quantized.graph, RESIDUAL)
     card = {**upscaler.spec.card, "quantized_from": upscaler.spec.sha256, "calibration": footage.played}
     helper.set_model_props(quantized, {**metadata, "name": name, "precision": "int8", "card": json.dumps(card)})
     onnx.checker.check_model(quantized, full_check=True)
@@ -126,32 +132,69 @@ def _quantized_nodes(graph: onnx.GraphProto) -> list[str]:
     return nodes
 
 
-def split_merged_head(graph: onnx.GraphProto, spec: ModelSpec) -> None:
-    """Undo in place what `model.network.MergedHead` joined, if there is one: 8 bits do for the residual, not for the interpolation."""
-    weights = {tensor.name: tensor for tensor in graph.initializer}
-    made_by = {output: node for node in graph.node for output in node.output}
-    head = next((node for node in graph.node if node.op_type == "Conv" and node.input[1] == "network.head.conv.weight"), None)
-    if head is None:
+def split_carried_cells(graph: onnx.GraphProto, spec: ModelSpec) -> None:
+    """Take the picture's cells out of the layers of a `model.lean` network, in place: 8 bits do for features, not for codes beside them.
+
+    The head becomes one of features and one of cells, cut to what the layers would have left of them. Any other network stays as it is.
+    """
+    if spec.card.get("network", {}).get("architecture") != ARCHITECTURE:
         return
-    join = made_by[head.input[0]]
-    pad = made_by[join.input[0]]
-    weight = numpy_helper.to_array(weights[head.input[1]])
-    channels = spec.card["network"]["channels"]
-    features, cells = np.split(weight, [channels], axis=1)
-    for name, part in (("features", features), ("cells", cells)):
-        graph.initializer.append(numpy_helper.from_array(part.copy(), f"network.head.{name}.weight"))
-    parts = [
-        helper.make_node("Conv", [pad.input[0], "network.head.features.weight"], ["head_features"], name="head_features", pads=[1] * 4),
-        helper.make_node("Conv", [join.input[1], "network.head.cells.weight", head.input[2]], ["head_cells"], name="head_cells"),
-        helper.make_node("Add", ["head_features", "head_cells"], list(head.output), name="head"),
-    ]
-    gone = (pad.name, join.name)
-    nodes = [part for node in graph.node if node.name not in gone for part in (parts if node.name == head.name else [node])]
+    tensors = {tensor.name: tensor for tensor in graph.initializer}
+    stem, *blocks, head = (node for node in graph.node if node.op_type == "Conv")
+    features = numpy_helper.to_array(tensors[stem.input[1]]).shape[0] - CELL
+    for conv in (stem, *blocks):
+        inputs = CELL if conv is stem else features
+        for name, part in ((conv.input[1], np.s_[:features, :inputs]), (conv.input[2], np.s_[:features])):
+            tensors[name].CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensors[name])[part].copy(), name))
+    # Codes about zero: what 8 bits do to a weight then counts for detail alone, not for how bright a picture is.
+    bias = tensors[stem.input[2]]
+    gain = numpy_helper.to_array(tensors[stem.input[1]]).sum((1, 2, 3), dtype=np.float64)
+    bias.CopyFrom(numpy_helper.from_array((numpy_helper.to_array(bias) + MIDDLE * gain).astype(np.float32), bias.name))
+    weight = numpy_helper.to_array(tensors[head.input[1]])
+    cut = 1 + len(blocks)
+    new = {
+        "network.head.features.weight": weight[:, :features],
+        "network.head.cells.weight": weight[:, features:],
+        "middle": np.array(MIDDLE, np.float32),
+        "starts": np.array([cut, cut]),
+        "ends": np.array([-cut, -cut]),
+        "axes": np.array([2, 3]),
+    }
+    graph.initializer.extend(numpy_helper.from_array(array.copy(), name) for name, array in new.items())
+    graph.initializer.remove(tensors[head.input[1]])
+    cells, source = stem.input[0], head.input[0]
+    stem.input[0] = CODES
+    before = {stem.name: [helper.make_node("Sub", [cells, "middle"], [CODES], name=CODES), stem]}
+    instead = {
+        head.name: [
+            helper.make_node("Conv", [source, "network.head.features.weight", head.input[2]], [RESIDUAL], name=RESIDUAL),
+            helper.make_node("Slice", [cells, "starts", "ends", "axes"], ["head_source"], name="head_source"),
+            helper.make_node("Conv", ["head_source", "network.head.cells.weight"], ["head_cells"], name="head_cells"),
+            helper.make_node("Add", [RESIDUAL, "head_cells"], list(head.output), name="head"),
+        ]
+    }
+    nodes = [part for node in graph.node for part in {**before, **instead}.get(node.name, [node])]
     del graph.node[:]
     graph.node.extend(nodes)
-    used = {name for node in graph.node for name in node.input}
-    for tensor in [tensor for tensor in graph.initializer if tensor.name not in used]:
-        graph.initializer.remove(tensor)
+    del graph.value_info[:]  # whose shapes are those of the wider layers
+
+
+def exact_codes(graph: onnx.GraphProto) -> dict[str, list[dict[str, Any]]]:
+    """What the quantizer is told of the codes about zero, where there are any: each has a number of its own."""
+    there = any(CODES in node.output for node in graph.node)
+    return {CODES: [{"scale": np.array(1, np.float32), "zero_point": np.array(MIDDLE, np.uint8)}]} if there else {}
+
+
+def leave_float(graph: onnx.GraphProto, tensor: str) -> None:
+    """Take a tensor's 8 bits away, in place: with one step for the residual of Y, U and V, half a code of U would be lost."""
+    down = next((node for node in graph.node if node.op_type == "QuantizeLinear" and node.input[0] == tensor), None)
+    if down is None:
+        return
+    up = next(node for node in graph.node if node.op_type == "DequantizeLinear" and node.input[0] == down.output[0])
+    for node in graph.node:
+        node.input[:] = [tensor if name == up.output[0] else name for name in node.input]
+    graph.node.remove(down)
+    graph.node.remove(up)
 
 
 @contextmanager

@@ -19,12 +19,14 @@ class Fusible(Protocol):
 class LinearTriple(nn.Module):
     """Three convolutions with nothing between them, equal to one 3x3 convolution (GameSR, section A.2).
 
-    Takes and gives (N, C, H, W). `forward` collapses the weights and runs one convolution, so a training step costs
-    what inference costs (SESR, "collapsible linear blocks") while the optimizer sees the wide parameters.
+    Takes (N, C, H, W) and gives the same, or without `padding` (N, C, H - 2, W - 2). `forward` collapses the weights and runs one
+    convolution, so a training step costs what inference costs (SESR, "collapsible linear blocks") while the optimizer sees the
+    wide parameters.
     """
 
-    def __init__(self, channels: int, expanded: int) -> None:
+    def __init__(self, channels: int, expanded: int, *, padding: int = 1) -> None:
         super().__init__()
+        self.padding = padding
         self.expand = nn.Conv2d(channels, expanded, 1)
         self.middle = nn.Conv2d(expanded, expanded, 3)
         self.compress = nn.Conv2d(expanded, channels, 1)
@@ -44,7 +46,7 @@ class LinearTriple(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         weight, bias = self.collapsed()
-        return F.conv2d(x, weight, bias, padding=1)
+        return F.conv2d(x, weight, bias, padding=self.padding)
 
     def forward_unfused(self, x: Tensor) -> Tensor:
         """The three convolutions one after the other; the reference for `forward`.
@@ -52,7 +54,7 @@ class LinearTriple(nn.Module):
         The zero ring is added before the expanding 1x1, so that the ring holds that convolution's bias: padding after
         it would differ from the fused form on every border pixel.
         """
-        out: Tensor = self.compress(self.middle(self.expand(F.pad(x, (1, 1, 1, 1)))))
+        out: Tensor = self.compress(self.middle(self.expand(F.pad(x, (self.padding,) * 4))))
         return out
 
     def fused(self) -> nn.Conv2d:
@@ -60,7 +62,7 @@ class LinearTriple(nn.Module):
         wide = LinearTriple(self.expand.in_channels, self.expand.out_channels).double()
         wide.load_state_dict(self.state_dict())
         weight, bias = wide.collapsed()
-        conv = nn.Conv2d(self.expand.in_channels, self.compress.out_channels, 3, padding=1)
+        conv = nn.Conv2d(self.expand.in_channels, self.compress.out_channels, 3, padding=self.padding)
         conv.to(self.expand.weight.device, self.expand.weight.dtype)
         with torch.no_grad():
             conv.weight.copy_(weight)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import nn
 
 from model.complexity import parameter_count
-from model.network import PRESETS, GameSR, MergedHead, NetworkConfig
+from model.network import PRESETS, GameSR, NetworkConfig
 from model.planes import Planes, State
 from model.reparam import fuse
 from tests.networks import random_clip, random_network
@@ -23,8 +22,6 @@ from tests.networks import random_clip, random_network
         ("planes-plain", 2, 288_472, 129_112),
         ("planes", 2, 288_472 + 1_700, 129_112 + 1_700),  # and the learned kernels under the residual
         ("planes", 3, 297_142 + 3_825, 137_782 + 3_825),
-        ("live", 2, 91_548, 27_804),
-        ("balanced", 2, 91_548 + 4 * 41_120, 27_804 + 4 * 9_248),
     ],
 )
 def test_parameter_counts(preset: str, scale: int, training: int, fused: int) -> None:
@@ -81,41 +78,15 @@ def test_an_untrained_network_is_bicubic(preset: str) -> None:
     torch.testing.assert_close(picture.y[:, 0], expected, rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize("preset", ["live", "balanced", "planes"])
+@pytest.mark.parametrize("preset", ["planes", "paper"])
 @pytest.mark.parametrize("scale", [2, 3])
 def test_the_form_that_runs_gives_the_same_picture_to_the_border(preset: str, scale: int) -> None:
     network = random_network(preset, scale).double()
     clip = random_clip(1, 2, 16, 24)
     before, _ = network(clip)
-    running = network.deployed()
-    assert isinstance(running.head, MergedHead) == (preset != "planes")
-    after, _ = running(clip)
+    after, _ = network.deployed()(clip)
     for expected, found in zip(before, after, strict=True):
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize("scale", [2, 3])
-def test_the_base_of_a_lean_network_is_bicubic_of_luma_and_of_chroma_with_the_far_taps_cut(scale: int) -> None:
-    """What is cut off weighs little: a flat plane stays flat, and a slope of one code a sample stays within a quarter of a code."""
-    network = GameSR(NetworkConfig(scale=scale, **PRESETS["live"])).double()
-    whole = GameSR(NetworkConfig(scale=scale)).double()
-    columns = torch.arange(16, dtype=torch.float64).expand(1, 1, 1, 8, 16)
-    for plane, tolerance in ((torch.full_like(columns, 77.0), 1e-9), (columns + 90, 0.25)):
-        clip = Planes(random_clip(1, 1, 16, 32).y.double(), plane, plane)
-        (lean, _), (full, _) = network(clip), whole(clip)
-        torch.testing.assert_close(lean.y, full.y, rtol=0, atol=1e-4)
-        torch.testing.assert_close(lean.u, full.u, rtol=0, atol=tolerance)
-
-
-def test_what_runs_of_a_lean_block_is_one_convolution() -> None:
-    blocks = random_network("live", 2).deployed().blocks
-    assert [[type(layer) for layer in block] for block in blocks] == [[nn.Conv2d, nn.LeakyReLU]] * 2
-
-
-def test_a_lean_network_has_planes_and_a_learned_base() -> None:
-    for wrong in ({"colour": "rgb"}, {"learned_base": False}):
-        with pytest.raises(ValueError, match="a lean network is one of planes"):
-            NetworkConfig(**{"lean": True, "learned_base": True, **wrong})
 
 
 def test_a_planes_network_needs_an_even_unshuffle() -> None:

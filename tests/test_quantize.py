@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +17,16 @@ from client.upscaler import OnnxUpscaler
 from model import hard_cases
 from model.cli import export_main, train_main, verify_main
 from model.export import export_baseline, export_network
+from model.lean import Lean, LeanConfig
 from model.network import GameSR, NetworkConfig
-from model.quantize import quantize, split_merged_head
+from model.planes import Network
+from model.quantize import CODES, RESIDUAL, quantize, split_carried_cells
 from model.quantize_cli import main
 from tests.moving import picture, write_footage
 
-NETWORKS = {  # one without a state whose base is merged into its head, and one with a state whose base is apart
-    "merged": NetworkConfig(unshuffle=4, channels=8, expanded=8, blocks=2, recurrent=False, learned_base=True, lean=True),
-    "recurrent": NetworkConfig(channels=8, expanded=8, blocks=1, learned_base=True, skip=True),
+NETWORKS: dict[str, Callable[[], Network]] = {  # one without a state whose layers carry the cells, and one with a state whose base is apart
+    "carrying": lambda: Lean(LeanConfig(channels=14, expanded=8, blocks=2)),
+    "recurrent": lambda: GameSR(NetworkConfig(channels=8, expanded=8, blocks=1, learned_base=True, skip=True)),
 }
 
 
@@ -33,12 +35,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Each network as NAME.onnx and NAME-int8.onnx, and the clip that those were calibrated on."""
     folder = tmp_path_factory.mktemp("quantize")
     write_footage(folder)
-    for name, config in NETWORKS.items():
+    for name, make in NETWORKS.items():
         torch.manual_seed(0)
-        network = GameSR(config)
+        network = make()
         with torch.no_grad():
             for parameter in network.parameters():
-                parameter.add_(0.03 * torch.randn_like(parameter))
+                parameter.add_(0.05 * torch.randn_like(parameter))
         export_network(network.eval(), folder / f"{name}.onnx", name=name, card={"steps": 0})
         quantize(folder / f"{name}.onnx", folder / f"{name}-int8.onnx", [folder / "clip.mkv"], name=f"{name}-int8", frames=6)
     return folder
@@ -61,11 +63,22 @@ def played(model: Path, frames: list[Frame], provider: str) -> Iterator[Frame]:
 @pytest.mark.parametrize("provider", ["cpu", "openvino"])
 def test_int8_comes_near_the_float32_artifact(folder: Path, name: str, provider: str) -> None:
     frames = [picture(t, 96, 144) for t in range(20)]
-    error = codes(folder / f"{name}-int8.onnx", frames, provider) - codes(folder / f"{name}.onnx", frames)
     bicubic = folder / "bicubic.onnx"
     export_baseline("bicubic", 2, bicubic)
-    done = codes(folder / f"{name}.onnx", frames) - codes(bicubic, frames)
-    assert 0 < np.square(error.astype(float)).mean() < 0.01 * np.square(done.astype(float)).mean()
+    for plane in "yuv":
+        rounded, exact, nothing = (
+            np.stack([getattr(p, plane) for p in played(model, frames, by)]).astype(float)
+            for model, by in ((folder / f"{name}-int8.onnx", provider), (folder / f"{name}.onnx", "cpu"), (bicubic, "cpu"))
+        )
+        assert 0 < np.square(rounded - exact).mean() < 0.01 * np.square(exact - nothing).mean(), plane
+
+
+def test_codes_keep_their_numbers_and_what_is_added_to_the_interpolation_stays_float(folder: Path) -> None:
+    graph = onnx.load(folder / "carrying-int8.onnx").graph
+    tensors = {t.name: numpy_helper.to_array(t) for t in graph.initializer}
+    (codes_down,) = (node for node in graph.node if node.op_type == "QuantizeLinear" and node.input[0] == CODES)
+    assert (tensors[codes_down.input[1]], tensors[codes_down.input[2]]) == (1, 128)
+    assert [node.op_type for node in graph.node if RESIDUAL in node.input] == ["Add"]
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -83,8 +96,8 @@ def test_weights_are_symmetric_per_channel_and_what_must_stay_float_does(folder:
         assert source[source[conv.input[0]].input[0]].op_type == "QuantizeLinear"
         assert tensors[source[conv.input[0]].input[2]].dtype == np.uint8
         int8_weights.add(source[conv.input[1]].input[0].removeprefix("network.").removesuffix(".weight_quantized"))
-    if name == "merged":
-        assert int8_weights == {"stem", "blocks.0.0", "blocks.1.0", "head.features"} and float_weights == {"head.cells"}
+    if name == "carrying":
+        assert int8_weights == {"stem", "blocks.0", "blocks.1", "head.features"} and float_weights == {"head.cells"}
     else:
         assert int8_weights == {"stem", "blocks.0.conv"}
         assert float_weights == {"lstm.gates", "head", "luma_base", "chroma_base"}
@@ -98,22 +111,22 @@ def test_it_is_the_same_model_to_the_client_but_for_its_precision(folder: Path, 
     assert ours.card == {**theirs.card, "quantized_from": theirs.sha256, "calibration": ["clip.mkv (6 frames)"]}
 
 
-def test_a_split_head_is_the_merged_one(folder: Path, tmp_path: Path) -> None:
-    model = onnx.load(folder / "merged.onnx")
-    split_merged_head(model.graph, OnnxUpscaler(folder / "merged.onnx", threads=1).spec)
+def test_without_the_cells_in_its_layers_it_is_the_same_network(folder: Path, tmp_path: Path) -> None:
+    model = onnx.load(folder / "carrying.onnx")
+    split_carried_cells(model.graph, OnnxUpscaler(folder / "carrying.onnx", threads=1).spec)
     onnx.save(model, tmp_path / "split.onnx")
     frames = list(hard_cases.noise(48, 32, 4))
-    error = codes(tmp_path / "split.onnx", frames) - codes(folder / "merged.onnx", frames)
+    error = codes(tmp_path / "split.onnx", frames) - codes(folder / "carrying.onnx", frames)
     assert np.abs(error).max() <= 1 and np.count_nonzero(error) < 1e-3 * error.size
     apart = onnx.load(folder / "recurrent.onnx")
-    split_merged_head(apart.graph, OnnxUpscaler(folder / "recurrent.onnx", threads=1).spec)
+    split_carried_cells(apart.graph, OnnxUpscaler(folder / "recurrent.onnx", threads=1).spec)
     assert apart == onnx.load(folder / "recurrent.onnx")
 
 
 def test_any_size_and_a_lost_state_go_through_it(folder: Path) -> None:
     for size in ((2, 2), (6, 34), (35, 17)):
         frames = list(hard_cases.noise(size[1], size[0], 2))
-        assert all((p.height, p.width) == (2 * size[0], 2 * size[1]) for p in played(folder / "merged-int8.onnx", frames, "cpu"))
+        assert all((p.height, p.width) == (2 * size[0], 2 * size[1]) for p in played(folder / "carrying-int8.onnx", frames, "cpu"))
     upscaler = OnnxUpscaler(folder / "recurrent-int8.onnx", threads=1)
     state = upscaler.initial_state(48, 64)
     state.tensors()[1][0, 3, 2, 1] = np.nan
@@ -126,8 +139,8 @@ def test_what_cannot_be_quantized_is_refused(folder: Path, tmp_path: Path) -> No
     (tmp_path / "broken.h264").write_bytes(bytes(range(256)) * 40)
     for model, clip, error, sentence in (
         (tmp_path / "bicubic.onnx", folder / "clip.mkv", ModelError, "no layer that is quantized"),
-        (folder / "merged-int8.onnx", folder / "clip.mkv", ModelError, "is int8 already"),
-        (folder / "merged.onnx", tmp_path / "broken.h264", InputError, "broken.h264"),
+        (folder / "carrying-int8.onnx", folder / "clip.mkv", ModelError, "is int8 already"),
+        (folder / "carrying.onnx", tmp_path / "broken.h264", InputError, "broken.h264"),
     ):
         with pytest.raises(error, match=sentence):
             quantize(model, tmp_path / "out.onnx", [clip], name="out", frames=2)

@@ -11,13 +11,14 @@ import torch
 from client.artifact import load_session
 from client.errors import ModelError
 from client.models import find_model
+from model.lean import LEAN
 from model.network import PRESETS
 from model.planes import Planes
 from model.reach import MAX_CELLS, network_reach, reach
 from tests.networks import random_network
 
 
-@pytest.mark.parametrize("preset", ["live", "planes", "planes-no-lstm", "paper-no-lstm"])
+@pytest.mark.parametrize("preset", ["planes", "planes-no-lstm", "paper-no-lstm"])
 def test_a_network_reaches_as_far_as_its_convolutions_in_a_row(preset: str) -> None:
     network = random_network(preset).deployed().double()
     config = network.config
@@ -26,8 +27,14 @@ def test_a_network_reaches_as_far_as_its_convolutions_in_a_row(preset: str) -> N
     assert network_reach(network) == (cells + ends) * config.size_multiple
 
 
+@pytest.mark.parametrize("preset", LEAN)
+def test_a_lean_network_reaches_as_far_as_it_extends_the_picture(preset: str) -> None:
+    network = random_network(preset).deployed().double()
+    assert network_reach(network) == (1 + network.config.blocks + 1) * 2
+
+
 def test_every_preset_has_an_end() -> None:
-    assert all(network_reach(random_network(preset).deployed().double()) for preset in PRESETS)
+    assert all(network_reach(random_network(preset).deployed().double()) for preset in (*PRESETS, *LEAN))
 
 
 def test_an_average_over_the_picture_has_none() -> None:

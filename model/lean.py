@@ -1,0 +1,177 @@
+"""The live tiers' network: no memory, no norm, no padding inside, and layers that carry the picture's own cells to the head.
+
+Convolutions are the cheap part of a network on a CPU that multiplies matrices; passes over memory beside them are not. So what runs is a
+row of plain 3x3 convolutions and leaky ReLUs, all of one width: identities, the bicubic base and the cells that it needs are part of
+their weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Literal, Self
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from model.interpolation import LearnedInterpolation, chroma_shift, exact
+from model.planes import INPUT_GAIN, RESIDUAL_GAIN, Network, Planes, State
+from model.reparam import LinearTriple, fuse
+
+ARCHITECTURE = "lean"
+LEAK = 0.1  # of the ReLUs: without it, and without a norm, whole blocks died within a thousand steps
+BLOCKS = (2, 1, 1)  # a cell's side in pixels of Y, U and V
+CELL = sum(block**2 for block in BLOCKS)  # samples of a cell
+
+
+@dataclass(frozen=True)
+class LeanConfig:
+    """Everything that decides the network's shape.
+
+    `channels` is the width of what runs: features and the six samples of a cell. AMX computes 32 in one go, whatever part of them is used.
+    """
+
+    scale: Literal[2, 3] = 2
+    channels: int = 32
+    expanded: int = 64
+    blocks: int = 2
+
+    @property
+    def features(self) -> int:
+        return self.channels - CELL
+
+
+LEAN: dict[str, dict[str, int]] = {"live": {}, "balanced": {"blocks": 6}}
+
+
+class LeanBlock(nn.Module):
+    """A linear triple, residual, leaky ReLU; (N, C, h, w) to (N, C, h - 2, w - 2)."""
+
+    def __init__(self, channels: int, expanded: int) -> None:
+        super().__init__()
+        self.conv = LinearTriple(channels, expanded, padding=0)
+        # It begins as nothing but the leak: depth costs no stability, and blocks can be added to a trained network.
+        nn.init.zeros_(self.conv.compress.weight)
+        assert self.conv.compress.bias is not None
+        nn.init.zeros_(self.conv.compress.bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.leaky_relu(x[:, :, 1:-1, 1:-1] + self.conv(x), LEAK)
+
+    def fused(self) -> nn.Conv2d:
+        """The convolution that runs before the ReLU, the identity being linear too (RepVGG, section 3.3)."""
+        conv = self.conv.fused()
+        with torch.no_grad():
+            conv.weight[:, :, 1, 1] += torch.eye(conv.in_channels).to(conv.weight)
+        return conv
+
+
+class FlatInterpolation(LearnedInterpolation):
+    """A learned kernel that bfloat16 holds exactly and that still sums to one there: a flat area stays flat in either precision."""
+
+    def kernel(self) -> Tensor:
+        kernel = super().kernel()
+        flat = kernel.detach().flatten(1).bfloat16().to(kernel.dtype)
+        smallest = flat.abs().argmin(1, keepdim=True)  # where bfloat16 is finest
+        rest = 1 - flat.sum(1, keepdim=True)
+        flat.scatter_(1, smallest, (flat.gather(1, smallest) + rest).bfloat16().to(kernel.dtype))
+        return flat.reshape(kernel.shape) + (kernel - kernel.detach())  # adds nothing but the kernel's gradient
+
+
+class Lean(Network):
+    """The network of a `LeanConfig`: planes of float code values in and out, neither rounded nor clamped.
+
+    The decoded planes are extended by as many cells as the layers reach, edges replicated, and every convolution shrinks them by
+    one: oneDNN takes half as long again over one that pads. Untrained it is bicubic interpolation, but for
+    chroma, whose kernels are cut to the cells beside a cell, and for rounding the kernels to bfloat16.
+    """
+
+    def __init__(self, config: LeanConfig) -> None:
+        super().__init__(config.scale, 2, {"architecture": ARCHITECTURE, **asdict(config)})
+        self.config = config
+        self.sides = [block * config.scale for block in BLOCKS]
+        self.stem = nn.Conv2d(CELL, config.features, 3)
+        self.blocks = nn.ModuleList(LeanBlock(config.features, config.expanded) for _ in range(config.blocks))
+        self.head = nn.Conv2d(config.features, sum(side**2 for side in self.sides), 3)
+        nn.init.zeros_(self.head.weight)
+        assert self.head.bias is not None
+        nn.init.zeros_(self.head.bias)
+        self.luma_base = FlatInterpolation("bicubic", config.scale, BLOCKS[0], reach=1)
+        self.chroma_base = FlatInterpolation("bicubic", config.scale, BLOCKS[1], chroma_shift(config.scale), reach=1)
+        self.carrying = False
+
+    def step(
+        self, frame: Planes, state: State | None, finish: Callable[[Tensor], Tensor] = lambda samples: samples
+    ) -> tuple[Planes, State | None]:
+        cells = self._cells(frame)
+        x = cells if self.carrying else INPUT_GAIN * (cells / 255 - 0.5)
+        x = F.leaky_relu(self.stem(x), LEAK)
+        for block in self.blocks:
+            x = F.leaky_relu(block(x), LEAK) if self.carrying else block(x)
+        x = self.head(x)
+        if not self.carrying:
+            with exact(x):
+                base = torch.cat((self.luma_base(frame.y), self.chroma_base(frame.u), self.chroma_base(frame.v)), 1)
+                x = base + 255 * RESIDUAL_GAIN * x.to(base.dtype)
+        parts = torch.split(finish(x), [side**2 for side in self.sides], 1)
+        return Planes(*(shuffle_channels_last(part, side) for part, side in zip(parts, self.sides, strict=True))), None
+
+    def deployed(self) -> Self:
+        """Features and cells side by side in every layer, in place: codes are not negative, so the ReLUs let them through."""
+        fuse(self.blocks)
+        bases = block_diagonal([base.kernel().detach().double() for base in (self.luma_base, self.chroma_base, self.chroma_base)])
+        onward = torch.zeros_like(bases[:CELL])
+        onward[:, :, 1, 1] = torch.eye(CELL)
+        weight, bias = weight_and_bias(self.stem)
+        self.stem = self._convolution(torch.cat((INPUT_GAIN / 255 * weight, onward)), bias - 0.5 * INPUT_GAIN * weight.sum((1, 2, 3)))
+        for index, block in enumerate(self.blocks):
+            weight, bias = weight_and_bias(block)
+            self.blocks[index] = self._convolution(block_diagonal([weight, onward]), bias)
+        weight, bias = weight_and_bias(self.head)
+        self.head = self._convolution(torch.cat((255 * RESIDUAL_GAIN * weight, bases), 1), 255 * RESIDUAL_GAIN * bias)
+        del self.luma_base, self.chroma_base
+        self.carrying = True
+        return self
+
+    def _cells(self, frame: Planes) -> Tensor:
+        """Cells (N, 6, H/2 + 2R, W/2 + 2R) of the planes, extended by the R cells that the layers reach."""
+        reach = self.config.blocks + 2
+        planes = [F.pad(plane, (reach * block,) * 4, mode="replicate") for plane, block in zip(frame, BLOCKS, strict=True)]
+        return torch.cat([F.pixel_unshuffle(plane, block) for plane, block in zip(planes, BLOCKS, strict=True)], 1)
+
+    def _convolution(self, weight: Tensor, bias: Tensor) -> nn.Conv2d:
+        """One with the given weights, without padding; outputs beyond the biases have none."""
+        conv = nn.Conv2d(weight.shape[1], weight.shape[0], 3).to(self.weight)
+        assert conv.bias is not None
+        with torch.no_grad():
+            conv.weight.copy_(weight)
+            conv.bias.zero_()[: len(bias)] = bias
+        return conv
+
+
+def weight_and_bias(conv: nn.Module) -> tuple[Tensor, Tensor]:
+    """Those of a convolution, in float64."""
+    assert isinstance(conv, nn.Conv2d) and conv.bias is not None
+    return conv.weight.detach().double(), conv.bias.detach().double()
+
+
+def shuffle_channels_last(cells: Tensor, block: int) -> Tensor:
+    """PixelShuffle of one plane, (N, block^2, h, w) to (N, 1, block*h, block*w), by way of the layout that convolutions leave.
+
+    There it moves rows of `block` samples; OpenVINO's DepthToSpace takes twice as long.
+    """
+    n, _, h, w = cells.shape
+    rows = cells.permute(0, 2, 3, 1).reshape(n, h, w, block, block).permute(0, 1, 3, 2, 4)
+    return rows.reshape(n, 1, block * h, block * w)
+
+
+def block_diagonal(kernels: list[Tensor]) -> Tensor:
+    """Kernels (O, I, h, w) of convolutions beside each other as that of one, zero between them."""
+    inputs, outputs = sum(k.shape[1] for k in kernels), sum(k.shape[0] for k in kernels)
+    whole = kernels[0].new_zeros(outputs, inputs, *kernels[0].shape[2:])
+    row = column = 0
+    for kernel in kernels:
+        whole[row : row + kernel.shape[0], column : column + kernel.shape[1]] = kernel
+        row, column = row + kernel.shape[0], column + kernel.shape[1]
+    return whole
