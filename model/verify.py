@@ -144,9 +144,9 @@ def play_together(upscalers: Sequence[OnnxUpscaler], network: Network | None, fr
             picture, state = upscaler.step(frame, states[index])
             duration_ns = time.perf_counter_ns() - begin_ns
             states[index] = state
-            tensors = state.tensors()
-            error = None if expected is None else step_error(upscaler.provider, step, picture, tensors, *expected)
-            together.append(Played(picture, duration_ns, state.restarted, tensors, error))
+            arrays = state.arrays()
+            error = None if expected is None else step_error(upscaler.provider, step, picture, arrays, *expected)
+            together.append(Played(picture, duration_ns, state.restarted, arrays, error))
         yield together
 
 
