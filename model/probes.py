@@ -142,6 +142,11 @@ def same_picture(a: Frame, b: Frame) -> bool:
     return all(np.array_equal(p, q) for p, q in zip((a.y, a.u, a.v), (b.y, b.u, b.v), strict=True))
 
 
+def samples_of(frame: Frame) -> NDArray[np.int16]:
+    """All samples of the three planes in one row, with room for their differences."""
+    return np.concatenate([plane.ravel() for plane in (frame.y, frame.u, frame.v)]).astype(np.int16)
+
+
 def _needs_state(subject: Subject) -> None:
     if not subject.upscaler.spec.state:
         raise LeftOut("it has no state")
@@ -172,6 +177,5 @@ def _agreement(subject: Subject, upscalers: Sequence[OnnxUpscaler], steps: int) 
 def _pictures_and_states(upscaler: OnnxUpscaler, subject: Subject, steps: int) -> tuple[NDArray[np.int16], NDArray[np.float64]]:
     """All samples of all pictures, and the last state, each in one row."""
     played = list(play(upscaler, None, hud(subject.width, subject.height, steps)))
-    samples = [plane.ravel() for p in played for plane in (p.picture.y, p.picture.u, p.picture.v)]
     state = [tensor.ravel().astype(np.float64) for tensor in played[-1].state]
-    return np.concatenate(samples).astype(np.int16), np.concatenate(state or [np.zeros(0)])
+    return np.concatenate([samples_of(p.picture) for p in played]), np.concatenate(state or [np.zeros(0)])
