@@ -227,7 +227,7 @@ def test_growing_errors_and_lost_states_are_failures(folder: Path) -> None:
 
     def played(slope: float) -> Iterator[Played]:
         for step in range(1, 301):
-            yield Played(picture, 1000, False, state, StepError("cpu", step, 0, 0, 0.0, None, 1e-7, 1e-7 + slope * step))
+            yield Played(picture, 1000, False, state, StepError("cpu", step, 0, 0, 0.0, None, 1e-7, 1e-7 + slope * step, 1.0))
 
     assert tally(tested, played(0.0)).passed
     drifting = tally(tested, played(1e-8))
