@@ -7,8 +7,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import onnx
 import pytest
 
+from client.models import find_model
 from client.upscaler import OnnxUpscaler
 from model.cli import evaluate_main, export_main, train_main, verify_main
 from model.verify import PARITY_HEADER, StepError
@@ -98,6 +100,26 @@ def test_verify_enforces_every_bound(
     assert verify_main(command) == (1 if sentence else 0)
     expected = f"gamesr-verify: {model} is too far from its float64 reference: {sentence}\n" if sentence else ""
     assert capsys.readouterr().err == expected
+
+
+def test_evaluate_refuses_two_models_of_one_name(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert export_main(["lanczos", "bicubic", "--folder", str(workshop)]) == 0
+    other = workshop / "bicubic_x2.onnx"
+    proto = onnx.load(other)
+    next(p for p in proto.metadata_props if p.key == "name").value = "bicubic"
+    onnx.save(proto, other)
+    command = [str(workshop / "footage.toml"), "--cache", str(workshop / "cache"), "--rows", str(workshop / "names.jsonl"), "--scales", "2"]
+    assert evaluate_main([*command, "--frames", "1", "--degradations", "area", "--models", "bicubic", str(other)]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f"gamesr-evaluate: {find_model('bicubic', 2)} and {other} are different models of one name, 'bicubic'")
+    assert not (workshop / "names.jsonl").exists()
+
+
+def test_an_artifact_named_twice_is_measured_once(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = [str(workshop / "footage.toml"), "--cache", str(workshop / "cache"), "--rows", str(workshop / "twice.jsonl"), "--scales", "2"]
+    names = ["bicubic", str(find_model("bicubic", 2))]
+    assert evaluate_main([*command, "--frames", "1", "--degradations", "area", "--json", "--models", *names]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == len((workshop / "twice.jsonl").read_text().splitlines()) == 1
 
 
 def test_evaluate_measures_each_row_once(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
