@@ -50,6 +50,11 @@ class State:
         self._check()
         return self._buffers.tensors(self._current)
 
+    def arrays(self) -> list[np.ndarray]:
+        """What the tensors hold, wherever they lie, in the order and the shapes of `tensors`: to be read, and before the next step."""
+        self._check()
+        return self._buffers.arrays(self._current)
+
     def _take(self) -> tuple[_StreamBuffers, int]:
         self._check()
         self._consumed = True
@@ -172,12 +177,17 @@ class _StreamBuffers:
     def tensors(self, current: int) -> list[np.ndarray]:
         if self._arrays[current] and self._runtime.has_own_memory:
             raise ProviderError(f"the state of {self._spec.name} lies in the memory of a device, where no part of it can be replaced")
-        return self._arrays[current]  # on the CPU a tensor made from an array is that array
+        return self._arrays[current]
+
+    def arrays(self, current: int) -> list[np.ndarray]:
+        if self._runtime.has_own_memory:
+            return [tensor.numpy() for tensor in self._states[current]]  # a copy of what lies there
+        return self._arrays[current]  # on the CPU a tensor made from an array is that array, and does not keep it alive
 
     def copy(self, current: int) -> _StreamBuffers:
         """Buffers of their own, whose state set 0 is this one's set `current`."""
         twin = _StreamBuffers(self._runtime, self._spec, self.height, self.width)
-        twin.fill(0, [tensor.numpy() for tensor in self._states[current]])
+        twin.fill(0, self.arrays(current))
         return twin
 
     def _zeros(self) -> list[np.ndarray]:

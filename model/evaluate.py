@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from client.errors import InputError
+from client.errors import InputError, ModelError
 from client.models import find_model
 from client.pipeline import upscale_stream
 from client.quality import QualityMeter
@@ -36,16 +36,18 @@ def evaluate(
 ) -> Iterator[Row]:
     """Every combination as a row of figures; rows already in `store` (JSON lines) are read from it, new ones appended.
 
+    Rows are told apart by the model's name, so two artifacts of one name are refused, and an artifact named twice has one row.
+
     Speed is not measured here but by gamesr-bench, so rows may be made while something else runs. A row is known by clip,
     scale, number of frames, provider and the artifact's digest; what its card says of parameters and multiply-accumulates stands
     in the row too. Raises what reading footage and models raises.
     """
     known = _read_rows(store)
+    upscalers = {scale: _upscalers([find_model(name, scale) for name in models], provider, threads) for scale in scales}
     for scale in scales:
-        upscalers = [OnnxUpscaler(find_model(name, scale), provider=provider, threads=threads) for name in models]
         for takes in load_pairs(scenes, cache, scale, degradations):
             for pair in takes:
-                for upscaler in upscalers:
+                for upscaler in upscalers[scale]:
                     spec = upscaler.spec
                     values = pair.title, scale, spec.name, spec.sha256, min(frames, len(pair)), provider
                     key = dict(zip(_KEY, values, strict=True))
@@ -55,6 +57,18 @@ def evaluate(
                         with store.open("a") as file:
                             file.write(json.dumps(row) + "\n")
                     yield {**row, "parameters": spec.card.get("parameters"), "macs_540p": spec.card.get("macs_540p")}
+
+
+def _upscalers(paths: Sequence[Path], provider: str, threads: int | None) -> list[OnnxUpscaler]:
+    """Each artifact once; raises ModelError for two of one name."""
+    by_name: dict[str, tuple[Path, OnnxUpscaler]] = {}
+    for path in paths:
+        upscaler = OnnxUpscaler(path, provider=provider, threads=threads)
+        name, sha256 = upscaler.spec.name, upscaler.spec.sha256
+        other, known = by_name.setdefault(name, (path, upscaler))
+        if known.spec.sha256 != sha256:
+            raise ModelError(f"{other} and {path} are different models of one name, {name!r}: export one of them under another")
+    return [upscaler for _, upscaler in by_name.values()]
 
 
 def _measure(pair: Pair, upscaler: OnnxUpscaler, frames: int) -> Row:

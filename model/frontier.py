@@ -19,11 +19,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 from tqdm import tqdm
 
-from client.errors import GamesrError
 from client.measurement import WARM_UP_FRAMES, Task, measure_in_fresh_process
 from client.models import find_model
 from client.runtime import PROVIDERS
 from client.synthetic import write_synthetic_clip
+from model.cli import run_command
 from model.evaluate import Row, evaluate
 from model.footage import Degradation, FootageCache, load_scenes
 
@@ -35,19 +35,21 @@ example:
 how it is measured:
   Quality is that of gamesr-evaluate, on the test scenes, by every runtime itself; rows are kept. Time is that of gamesr-bench:
   upscaling one frame of a made clip, 960x540 by 2 or 640x360 by 3, every run in a fresh process, models and runtimes in turn in
-  every round, p50 and p95 as medians over the rounds. Over bicubic: dB of PSNR-Y above bicubic on the same runtime, mean over a
-  game's scenes. Worst plane: the least that any of Y, U and V gains or loses over bicubic in any game. A model on a runtime is on the
-  frontier of an input when nothing that is as fast (p95) gains more PSNR-Y, games counted alike.
+  every round, p50 and p95 as medians over the rounds. Over bicubic: dB of PSNR-Y above bicubic on the cpu runtime, one zero for
+  all runtimes, mean over a game's scenes; bicubic on another runtime is a row like any other. Worst plane: the least that any of
+  Y, U and V gains or loses over that bicubic in any game. A model on a runtime is on the frontier of an input when nothing that is
+  as fast (p95) gains more PSNR-Y, games counted alike.
 
 Exit status: 0 done, 1 refused or failed (one sentence says why), 2 wrong usage, 130 interrupted.
 """
-YARDSTICK = "bicubic"
+YARDSTICK, YARDSTICK_PROVIDER = "bicubic", "cpu"  # bfloat16 costs bicubic itself up to 0.4 dB of chroma
+FEWEST_TIMED_FRAMES = 20  # of fewer, the nearest rank of the 95th percentile is the slowest
 PLANES = ("psnr_y_db", "psnr_u_db", "psnr_v_db")
 
 
 @dataclass(frozen=True)
 class Gains:
-    """What a model on a runtime gains over bicubic on one input; `psnr_y_db` by game. VMAF-NEG is a mean, not a difference."""
+    """What a model on a runtime gains over bicubic on cpu on one input; `psnr_y_db` by game. VMAF-NEG is a mean, no difference."""
 
     psnr_y_db: dict[str, float]
     worst_plane_db: float
@@ -76,22 +78,22 @@ class Candidate:
         return self.model if self.provider == "cpu" else f"{self.model}, {self.provider}"
 
 
-def gains_over_bicubic(rows: Sequence[Row]) -> dict[str, dict[str, Gains]]:
-    """By input, then by model, from rows of one runtime that hold bicubic too."""
-    groups: dict[tuple[str, str, str], list[Row]] = {}
+def gains_over_bicubic(rows: Sequence[Row]) -> dict[str, dict[tuple[str, str], Gains]]:
+    """By input, then by (runtime, model), from rows of any runtimes that hold bicubic on cpu too."""
+    groups: dict[tuple[str, str, str, str], list[Row]] = {}
     for row in rows:
         title, degradation = row["clip"].split()
-        groups.setdefault((degradation, row["model"], title.split("/")[0]), []).append(row)
-    gains: dict[str, dict[str, Gains]] = {}
-    for degradation, model in dict.fromkeys((degradation, model) for degradation, model, _ in groups):
+        groups.setdefault((degradation, row["provider"], row["model"], title.split("/")[0]), []).append(row)
+    gains: dict[str, dict[tuple[str, str], Gains]] = {}
+    for degradation, provider, model in dict.fromkeys(key[:3] for key in groups):
         over: dict[str, list[float]] = {}
         vmaf_neg: list[float | None] = []
-        for (_, _, game), own in [(key, group) for key, group in groups.items() if key[:2] == (degradation, model)]:
-            base = groups[degradation, YARDSTICK, game]
+        for (*_, game), own in [(key, group) for key, group in groups.items() if key[:3] == (degradation, provider, model)]:
+            base = groups[degradation, YARDSTICK_PROVIDER, YARDSTICK, game]
             over[game] = [fmean(row[plane] for row in own) - fmean(row[plane] for row in base) for plane in PLANES]
             vmaf_neg += [row["vmaf_neg"] for row in own]
         known = [value for value in vmaf_neg if value is not None]
-        gains.setdefault(degradation, {})[model] = Gains(
+        gains.setdefault(degradation, {})[provider, model] = Gains(
             {game: planes[0] for game, planes in over.items()},
             min(min(planes) for planes in over.values()),
             fmean(known) if len(known) == len(vmaf_neg) else None,
@@ -159,16 +161,16 @@ def drawing(candidates: Sequence[Candidate]) -> bytes:
 def measure(arguments: argparse.Namespace) -> list[Candidate]:
     """Every model on every runtime; raises GamesrError."""
     names = list(dict.fromkeys([YARDSTICK, *arguments.models]))
-    latencies = _latencies(names, arguments)
+    rows: list[Row] = []
+    for provider in dict.fromkeys([YARDSTICK_PROVIDER, *arguments.providers]):
+        models = names if provider in arguments.providers else [YARDSTICK]
+        rows += tqdm(_rows(models, provider, arguments), desc=provider, unit="row", disable=not sys.stderr.isatty())
+    gains = gains_over_bicubic(rows)
     candidates = []
-    for provider in arguments.providers:
-        rows = list(tqdm(_rows(names, provider, arguments), desc=provider, unit="row", disable=not sys.stderr.isatty()))
-        gains = gains_over_bicubic(rows)
-        for model in dict.fromkeys(row["model"] for row in rows):
-            row = next(row for row in rows if row["model"] == model)
-            p50_ms, p95_ms = latencies[provider, model]
-            of_model = {degradation: by_model[model] for degradation, by_model in gains.items()}
-            candidates.append(Candidate(model, provider, row["parameters"], row["macs_540p"], p50_ms, p95_ms, of_model))
+    for (provider, model), (p50_ms, p95_ms) in _latencies(names, arguments).items():
+        row = next(row for row in rows if (row["provider"], row["model"]) == (provider, model))
+        of_model = {degradation: by_model[provider, model] for degradation, by_model in gains.items()}
+        candidates.append(Candidate(model, provider, row["parameters"], row["macs_540p"], p50_ms, p95_ms, of_model))
     for degradation in candidates[0].gains:
         best = frontier([(c.p95_ms, c.gains[degradation].mean_db) for c in candidates])
         for candidate, on_frontier in zip(candidates, best, strict=True):
@@ -221,7 +223,12 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--scale", type=int, choices=(2, 3), default=2)
     parser.add_argument("--degradations", nargs="+", default=["area", "area@8000"], metavar="HOW", help="inputs (default: %(default)s)")
     parser.add_argument("--frames", type=int, default=24, help="of each scene, from its start (default: %(default)s)")
-    parser.add_argument("--timed-frames", type=int, default=30, help="frames of a timed run (default: %(default)s)")
+    parser.add_argument(
+        "--timed-frames",
+        type=_timed_frames,
+        default=30,
+        help=f"frames of a timed run, {FEWEST_TIMED_FRAMES} at least (default: %(default)s)",
+    )
     parser.add_argument("--rounds", type=int, default=5, help="timed runs of each (default: %(default)s)")
     parser.add_argument("--threads", type=int, help="threads of the models (default: the physical cores)")
     parser.add_argument("--rows", type=Path, default=Path("runs/evaluation.jsonl"), help="measured rows, kept (default: %(default)s)")
@@ -232,28 +239,27 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _timed_frames(text: str) -> int:
+    count = int(text)
+    if count < FEWEST_TIMED_FRAMES:
+        raise argparse.ArgumentTypeError(f"the p95 of {count} frames is their slowest: time {FEWEST_TIMED_FRAMES} or more")
+    return count
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
-    arguments = parser().parse_args(argv)
-    try:
+    command = parser()
+    arguments = command.parse_args(argv)
+
+    def work() -> None:
         candidates = measure(arguments)
         if arguments.svg:
             partial = arguments.svg.with_name(f".{arguments.svg.name}.{os.getpid()}.part")
             partial.write_bytes(drawing(candidates))
             partial.replace(arguments.svg)
-    except GamesrError as error:
-        if arguments.debug:
-            raise
-        print(f"{PROGRAM}: {error}", file=sys.stderr)
-        return 1
-    except OSError as error:
-        print(f"{PROGRAM}: {error.filename or 'file'}: {error.strerror}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print(f"{PROGRAM}: stopped; the same command goes on from the rows in {arguments.rows}", file=sys.stderr)
-        return 130
-    for candidate in candidates if arguments.json else ():
-        print(json.dumps(asdict(candidate)))
-    for degradation in () if arguments.json else candidates[0].gains:
-        print(f"Input {degradation}:\n\n{table(candidates, degradation)}\n")
-    return 0
+        for candidate in candidates if arguments.json else ():
+            print(json.dumps(asdict(candidate)))
+        for degradation in () if arguments.json else candidates[0].gains:
+            print(f"Input {degradation}:\n\n{table(candidates, degradation)}\n")
+
+    return run_command(command, arguments, work, f"stopped; the same command goes on from the rows in {arguments.rows}")

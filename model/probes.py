@@ -10,11 +10,12 @@ from time import perf_counter_ns
 import numpy as np
 from numpy.typing import NDArray
 
+from client.errors import ProviderError
 from client.frames import Frame
 from client.runtime import BFLOAT16, PROVIDERS, is_installed
 from client.upscaler import OnnxUpscaler
 from model.hard_cases import black, hud, noise
-from model.trial import Outcome, Subject, count_subnormals, tally
+from model.trial import Outcome, Subject, bounds_of, count_subnormals, tally
 from model.verify import Played, play
 
 SMALL_SIZES = ((1, 1), (2, 2), (3, 5), (2, 64), (35, 2), (17, 31), (64, 50))
@@ -76,7 +77,7 @@ def lost_state(subject: Subject, steps: int) -> Outcome:
                 reset = restarts == [True] + [False] * (steps - 1) and all(map(same_picture, pictures, fresh))
                 caught += reset
                 absorbed = not np.isnan(poison) and not everywhere and not any(restarts)
-                if not reset and not (absorbed and all(np.isfinite(tensor).all() for tensor in state.tensors())):
+                if not reset and not (absorbed and all(np.isfinite(array).all() for array in state.arrays())):
                     unnoticed.append(f"{poison} in {'all' if everywhere else 'one'} of {spec.input}")
     outcome = Outcome(subject.width, subject.height, steps * tried)
     remark = f"{caught} of {tried} caught and reset"
@@ -88,7 +89,7 @@ def denormals(subject: Subject, steps: int) -> Outcome:
     _needs_state(subject)
     height, width = subject.height, subject.width
     frames = list(black(width, height, 4))
-    zeros = subject.upscaler.initial_state(height, width).tensors()
+    zeros = subject.upscaler.initial_state(height, width).arrays()
     tiny = [np.full_like(tensor, np.finfo(tensor.dtype).smallest_normal / 512) for tensor in zeros]
     subject.upscaler.warm_up(height, width)
     usual_ns: list[list[int]] = []
@@ -102,7 +103,7 @@ def denormals(subject: Subject, steps: int) -> Outcome:
         for part in (slice(0, 1), slice(1, None))
     )
     _, state = subject.upscaler.step(frames[0], subject.upscaler.state_of(height, width, tiny))
-    left = sum(count_subnormals(tensor) for tensor in state.tensors())
+    left = sum(count_subnormals(array) for array in state.arrays())
     outcome = replace(Outcome(width, height, 2 * steps * len(frames)), subnormals=left)
     return outcome.noting(
         f"the frame given them takes {first:.1f} times as long, those after it {later:.2f} times",
@@ -119,18 +120,31 @@ def threads(subject: Subject, steps: int) -> Outcome:
 
 
 def providers(subject: Subject, steps: int) -> Outcome:
-    """The same frames through every installed provider that computes in float32: pictures must agree as with the reference."""
-    there = [name for name in PROVIDERS if name != BFLOAT16 and is_installed(name)]
+    """The same frames through every provider that starts here and rounds nothing to bfloat16: pictures must agree as with the reference."""
+    upscalers: list[OnnxUpscaler] = []
+    refused: list[str] = []
+    for name in PROVIDERS:
+        if name != BFLOAT16 and is_installed(name):
+            try:
+                upscalers.append(OnnxUpscaler(subject.path, provider=name))
+            except ProviderError as error:  # a runtime for a GPU where there is none says nothing about the artifact
+                refused.append(f"not {name}: {error}")
+    there = [upscaler.provider for upscaler in upscalers]
     if len(there) < 2:
-        raise LeftOut(f"no other provider than {subject.upscaler.provider} is installed")
-    outcome = _agreement(subject, [OnnxUpscaler(subject.path, provider=name) for name in there], steps)
-    bounds = subject.bounds
+        raise LeftOut("; ".join((f"no other provider than {' '.join(there)} runs here", *refused)))
+    outcome = _agreement(subject, upscalers, steps)
+    bounds = bounds_of(subject.upscaler.spec, there[0])  # of what is compared, whatever the other cases run on
     close = (outcome.max_code_error or 0) <= bounds.codes and (outcome.differing_share or 0) <= bounds.differing
-    return outcome.noting(" and ".join(there), (close, "providers differ"))
+    return outcome.noting("; ".join((" and ".join(there), *refused)), (close, "providers differ"))
 
 
 def same_picture(a: Frame, b: Frame) -> bool:
     return all(np.array_equal(p, q) for p, q in zip((a.y, a.u, a.v), (b.y, b.u, b.v), strict=True))
+
+
+def samples_of(frame: Frame) -> NDArray[np.int16]:
+    """All samples of the three planes in one row, with room for their differences."""
+    return np.concatenate([plane.ravel() for plane in (frame.y, frame.u, frame.v)]).astype(np.int16)
 
 
 def _needs_state(subject: Subject) -> None:
@@ -163,6 +177,5 @@ def _agreement(subject: Subject, upscalers: Sequence[OnnxUpscaler], steps: int) 
 def _pictures_and_states(upscaler: OnnxUpscaler, subject: Subject, steps: int) -> tuple[NDArray[np.int16], NDArray[np.float64]]:
     """All samples of all pictures, and the last state, each in one row."""
     played = list(play(upscaler, None, hud(subject.width, subject.height, steps)))
-    samples = [plane.ravel() for p in played for plane in (p.picture.y, p.picture.u, p.picture.v)]
     state = [tensor.ravel().astype(np.float64) for tensor in played[-1].state]
-    return np.concatenate(samples).astype(np.int16), np.concatenate(state or [np.zeros(0)])
+    return np.concatenate([samples_of(p.picture) for p in played]), np.concatenate(state or [np.zeros(0)])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from client.cloud import area_downscale
 from client.errors import ModelError
-from client.frames import Frame, Plane
+from client.frames import Frame
 from client.quality import psnr_db, squared_error
 from client.synthetic import synthetic_frames
 from model import hard_cases as pictures
@@ -111,7 +111,7 @@ def _still(subject: Subject, steps: int) -> Outcome:
     if whole.width < width or whole.height < height:
         raise LeftOut(f"the clip is smaller than {width}x{height}")
     truth = crop(whole, width, height)
-    watch = _Stillness(truth.y, min(SETTLED_AFTER, steps // 2))
+    watch = _Stillness(truth, min(SETTLED_AFTER, steps // 2))
     outcome = trial(subject, [area_downscale(truth, scale)] * steps, steps, watch)
     return outcome.noting(
         f"PSNR-Y {watch.settled_db:.3f} dB at frame {watch.settled_after}, {watch.psnr_change_db:+.4f} at the end; "
@@ -126,33 +126,34 @@ def _still(subject: Subject, steps: int) -> Outcome:
 class _Stillness:
     """Sees the pictures of a still go by, and says what changed after the first `settled_after` of them.
 
-    `flickering` is the share of luma samples that went one way and back; a sample that creeps over a rounding limit once
-    does not flicker. `state_change` is the RMS change of the state in the last frame.
+    `flickering` is the share of the samples of all planes that went one way and back; a sample that creeps over a rounding
+    limit once does not flicker. `state_change` is the RMS change of the state in the last frame.
     """
 
-    def __init__(self, truth: Plane, settled_after: int) -> None:
+    def __init__(self, truth: Frame, settled_after: int) -> None:
         self.settled_after = settled_after
         self.settled_db = self.last_db = math.inf
         self.largest_change = 0
         self.state_change = 0.0
-        self._truth = truth
-        self._last: Played | None = None
-        self._direction = np.zeros(truth.shape, np.int16)
-        self._flickered = np.zeros(truth.shape, np.bool_)
+        self._truth = truth.y
+        self._last: tuple[NDArray[np.int16], list[NDArray[np.floating]]] | None = None
+        self._direction = np.zeros_like(probes.samples_of(truth))
+        self._flickered = np.zeros(self._direction.shape, np.bool_)
 
     def __call__(self, step: int, played: Played) -> None:
-        luma = played.picture.y
+        luma, samples = played.picture.y, probes.samples_of(played.picture)
         squared = squared_error(self._truth, luma)
         self.last_db = psnr_db(squared / luma.size) if squared else math.inf
         if step == self.settled_after:
             self.settled_db = self.last_db
         if self._last is not None and step > self.settled_after:
-            change = np.subtract(luma, self._last.picture.y, dtype=np.int16)
-            self._flickered |= change * self._direction < 0
-            self._direction = np.where(change, change, self._direction)
+            last_samples, last_state = self._last
+            change = samples - last_samples
+            self._flickered |= np.sign(change) * self._direction < 0
+            self._direction = np.where(change, np.sign(change), self._direction)
             self.largest_change = max(self.largest_change, int(np.abs(change).max()))
-            self.state_change = _rms_change(self._last.state, played.state)
-        self._last = played
+            self.state_change = _rms_change(last_state, played.state)
+        self._last = samples, played.state
 
     @property
     def psnr_change_db(self) -> float:

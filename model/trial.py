@@ -153,20 +153,31 @@ def tally(subject: Subject, played: Iterable[Played], watch: Callable[[int, Play
     outcome = Outcome(width // scale, height // scale, len(durations_ns), nan_frames=nan_frames, subnormals=subnormals)
     outcome = replace(outcome, largest_state=largest, latency_us=LatencySummary.of(durations_ns))
     if errors:
-        outcome = replace(
-            outcome,
-            max_code_error=max(error.max_code_error for error in errors),
-            differing_share=float(np.mean([error.differing_pixels for error in errors])),
-            errors_at=tuple(error for error in errors if error.step in SHOWN_STEPS),
-        )
-    if errors and largest is not None:
-        outcome = replace(
-            outcome,
-            max_state_error=max(error.max_state_error for error in errors),
-            rms_state_error=max(error.rms_state_error for error in errors),
-            drift_per_1000_frames=_drift([error.rms_state_error for error in errors]),
-        )
+        outcome = _with_errors(outcome, errors)
     return replace(outcome, failures=tuple(_broken(outcome, subject.bounds)))
+
+
+def broken_by(errors: Sequence[StepError], bounds: Bounds) -> list[str]:
+    """What the errors of every step of one run of one provider break, each with what is allowed; none where they break nothing."""
+    largest = max(error.largest_state for error in errors)
+    return list(_broken(_with_errors(Outcome(0, 0, len(errors), largest_state=largest), errors), bounds))
+
+
+def _with_errors(outcome: Outcome, errors: Sequence[StepError]) -> Outcome:
+    outcome = replace(
+        outcome,
+        max_code_error=max(error.max_code_error for error in errors),
+        differing_share=float(np.mean([error.differing_pixels for error in errors])),
+        errors_at=tuple(error for error in errors if error.step in SHOWN_STEPS),
+    )
+    if outcome.largest_state is None:
+        return outcome
+    return replace(
+        outcome,
+        max_state_error=max(error.max_state_error for error in errors),
+        rms_state_error=max(error.rms_state_error for error in errors),
+        drift_per_1000_frames=_drift([error.rms_state_error for error in errors]),
+    )
 
 
 def count_subnormals(tensor: NDArray[np.floating]) -> int:

@@ -29,7 +29,8 @@ class StepError:
     """What one step's result differs by: pictures in code values (planes Y, U, V together), states in their own units.
 
     `provider` is what ran the artifact. `p999_code_error` is the 99.9th percentile of all samples' errors, `psnr_y_db` that of
-    the luma against the reference's rounded picture, None where the two are equal.
+    the luma against the reference's rounded picture, None where the two are equal. `largest_state` is the largest magnitude in
+    the artifact's state, which the bound of its error is relative to.
     """
 
     provider: str
@@ -40,6 +41,7 @@ class StepError:
     psnr_y_db: float | None
     max_state_error: float
     rms_state_error: float
+    largest_state: float
 
 
 def network_of_artifact(artifact: Path, weights: Path | None = None) -> Network:
@@ -144,9 +146,9 @@ def play_together(upscalers: Sequence[OnnxUpscaler], network: Network | None, fr
             picture, state = upscaler.step(frame, states[index])
             duration_ns = time.perf_counter_ns() - begin_ns
             states[index] = state
-            tensors = state.tensors()
-            error = None if expected is None else step_error(upscaler.provider, step, picture, tensors, *expected)
-            together.append(Played(picture, duration_ns, state.restarted, tensors, error))
+            arrays = state.arrays()
+            error = None if expected is None else step_error(upscaler.provider, step, picture, arrays, *expected)
+            together.append(Played(picture, duration_ns, state.restarted, arrays, error))
         yield together
 
 
@@ -214,4 +216,5 @@ def step_error(
         psnr_db(squared / picture.y.size) if squared else None,
         float(np.abs(drift).max()),
         float(np.sqrt(np.square(drift).mean())),
+        max((float(np.abs(part).max()) for part in state), default=0.0),
     )

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import onnx
 import pytest
 
+from client.models import find_model
 from client.upscaler import OnnxUpscaler
 from model.cli import evaluate_main, export_main, train_main, verify_main
-from model.verify import PARITY_HEADER
+from model.verify import PARITY_HEADER, StepError
 from tests.moving import write_footage
 
 TINY = ["--steps", "4", "--batch", "2", "--patch", "16", "--frames", "4", "--window", "2", "--degradations", "area"]
@@ -61,6 +65,61 @@ def test_verify_holds_the_artifact_against_float64(workshop: Path, capsys: pytes
     assert shown == [(f"| {frame}", provider) for frame in ("1", "10", "12", "any") for provider in ("cpu", "openvino")]
     assert verify_main([*command[:-1], "48x33"]) == 1
     assert "not a size" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("steps", "change", "sentence"),
+    [
+        (199, {"max_code_error": 2}, "on openvino 2 codes of picture error, at most 1 allowed"),
+        (199, {"differing_pixels": 0.002}, "on openvino 0.002 of the samples differ, at most 0.001 allowed"),
+        (199, {"max_state_error": 4e-4}, "on openvino 0.0004 of state error, at most 0.0003 allowed"),
+        (200, {"rms_state_error": 2e-9}, "on openvino 2e-06 of drift per 1,000 frames, at most 1e-06 allowed"),
+        (199, {"rms_state_error": 2e-9}, ""),
+    ],
+)
+def test_verify_enforces_every_bound(
+    workshop: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    steps: int,
+    change: dict[str, float],
+    sentence: str,
+) -> None:
+    """Of two providers one breaks a single bound; a drift of 2e-9 a frame shows in 200 frames. The largest state is 10."""
+
+    def parity(*_: object, providers: Sequence[str], **__: object) -> Iterator[StepError]:
+        for step in range(1, steps + 1):
+            for provider in providers:
+                sound = StepError(provider, step, 1, 0, 1e-4, None, 1e-5, 0.0, 10.0)
+                slope = {name: value * step if name == "rms_state_error" else value for name, value in change.items()}
+                yield sound if provider == "cpu" else replace(sound, **slope)
+
+    monkeypatch.setattr("model.cli.parity", parity)
+    model = str(workshop / "tiny_x2.onnx")
+    command = [model, str(workshop / "clip.mkv"), "--crop", "48x32", "--provider", "cpu", "openvino"]
+    assert verify_main(command) == (1 if sentence else 0)
+    expected = f"gamesr-verify: {model} is too far from its float64 reference: {sentence}\n" if sentence else ""
+    assert capsys.readouterr().err == expected
+
+
+def test_evaluate_refuses_two_models_of_one_name(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert export_main(["lanczos", "bicubic", "--folder", str(workshop)]) == 0
+    other = workshop / "bicubic_x2.onnx"
+    proto = onnx.load(other)
+    next(p for p in proto.metadata_props if p.key == "name").value = "bicubic"
+    onnx.save(proto, other)
+    command = [str(workshop / "footage.toml"), "--cache", str(workshop / "cache"), "--rows", str(workshop / "names.jsonl"), "--scales", "2"]
+    assert evaluate_main([*command, "--frames", "1", "--degradations", "area", "--models", "bicubic", str(other)]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f"gamesr-evaluate: {find_model('bicubic', 2)} and {other} are different models of one name, 'bicubic'")
+    assert not (workshop / "names.jsonl").exists()
+
+
+def test_an_artifact_named_twice_is_measured_once(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = [str(workshop / "footage.toml"), "--cache", str(workshop / "cache"), "--rows", str(workshop / "twice.jsonl"), "--scales", "2"]
+    names = ["bicubic", str(find_model("bicubic", 2))]
+    assert evaluate_main([*command, "--frames", "1", "--degradations", "area", "--json", "--models", *names]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == len((workshop / "twice.jsonl").read_text().splitlines()) == 1
 
 
 def test_evaluate_measures_each_row_once(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -227,7 +227,7 @@ def test_growing_errors_and_lost_states_are_failures(folder: Path) -> None:
 
     def played(slope: float) -> Iterator[Played]:
         for step in range(1, 301):
-            yield Played(picture, 1000, False, state, StepError("cpu", step, 0, 0, 0.0, None, 1e-7, 1e-7 + slope * step))
+            yield Played(picture, 1000, False, state, StepError("cpu", step, 0, 0, 0.0, None, 1e-7, 1e-7 + slope * step, 1.0))
 
     assert tally(tested, played(0.0)).passed
     drifting = tally(tested, played(1e-8))
@@ -238,11 +238,15 @@ def test_growing_errors_and_lost_states_are_failures(folder: Path) -> None:
     assert lost.nan_frames == 1 and lost.failures == ("the state was lost in 1 frames",)
 
 
+@pytest.mark.parametrize("plane", ["y", "u", "v"])
 @pytest.mark.parametrize(("codes", "fails"), [([100, 101] * 4, "flicker"), ([100, 103, 103, 103, 106, 109, 109, 109], "change by 3 codes")])
-def test_a_still_that_flickers_or_drifts_fails(folder: Path, monkeypatch: pytest.MonkeyPatch, codes: list[int], fails: str) -> None:
+def test_a_still_that_flickers_or_drifts_in_any_plane_fails(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, codes: list[int], fails: str, plane: str
+) -> None:
     def play_codes(*_: object) -> Iterator[Played]:
+        grey = Frame(*(np.full(shape, 100, np.uint8) for shape in ((48, 64), (24, 32), (24, 32))))
         for code in codes:
-            yield Played(Frame(*(np.full(shape, code, np.uint8) for shape in ((48, 64), (24, 32), (24, 32)))), 1000, False, [], None)
+            yield Played(replace(grey, **{plane: np.full_like(getattr(grey, plane), code)}), 1000, False, [], None)
 
     monkeypatch.setattr("model.trial.play", play_codes)
     still = next(case for case in CASES if case.name == "still")
