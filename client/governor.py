@@ -37,14 +37,16 @@ class Governor:
 
     Down it goes to the best tier that should fit, or to the last: when three frames in a row missed, when three wait, when the p95
     of the last 60 is over the deadline, or when six of the last 600 missed. Up it goes when none of 60 missed and the better tier should
-    fit: its warm-up cost, times how much slower than in its own warm-up the present tier runs, and what the frame takes besides, come to
-    at most 0.9 of the deadline in the 95th percentile and 0.95 of the period in the median. From any switch to one upwards pass 2 s; a
+    fit: its cost, times how much slower than in its own warm-up the present tier runs, and what the frame takes besides, come to
+    at most 0.9 of the deadline in the 95th percentile and 0.95 of the period in the median. The cost is that of warm-up, or the least
+    median of 60 frames that the tier has shown: warm-up has the stream beside it. From any switch to one upwards pass 2 s; a
     tier that does not last 10 s is next tried after twice as long as before, at most after 64 s.
     """
 
     def __init__(self, costs_ns: Sequence[int], *, deadline_ns: int, period_ns: int, now_ns: int) -> None:
         self.deadline_ns, self.period_ns = deadline_ns, period_ns
         self._costs_ns = costs_ns
+        self._least_ns = list(costs_ns)
         self._in_a_row = 0
         self._hold_ns = [HOLD_NS] * len(costs_ns)
         self._not_before_ns = [now_ns + HOLD_NS] * len(costs_ns)
@@ -64,6 +66,8 @@ class Governor:
         self._latencies_ns.append(latency_ns)
         self._upscale_ns.append(upscale_ns)
         self._besides_ns.append((latency_ns - upscale_ns, busy_ns - upscale_ns))
+        if len(self._upscale_ns) == WINDOW_FRAMES:
+            self._least_ns[self.tier] = min(self._least_ns[self.tier], _median(self._upscale_ns))
         return self._count(now_ns, missed=latency_ns > self.deadline_ns) or self._up(now_ns)
 
     def left_out(self, now_ns: int, *, waiting: int) -> Switch | None:
@@ -111,7 +115,7 @@ class Governor:
     def _fits(self, tier: int, share: float, pace_share: float) -> bool:
         """Whether frames should be in time with a tier, and none wait for ever longer, as slow as the machine is now."""
         slower = _median(self._upscale_ns) / max(1, self._costs_ns[self.tier])
-        cost_ns = self._costs_ns[tier] * slower
+        cost_ns = self._least_ns[tier] * slower
         late_ns = SPREAD * cost_ns + _p95([before_ns for before_ns, _ in self._besides_ns])
         busy_ns = cost_ns + _median([busy_ns for _, busy_ns in self._besides_ns])
         return late_ns <= share * self.deadline_ns and busy_ns <= pace_share * self.period_ns
