@@ -129,7 +129,8 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--frames", metavar="N", type=_count, default=120, help="pictures to send in each row (default: %(default)s)")
     parser.add_argument("--models", metavar="A,B", type=_names, default="bicubic,gamesr", help="shipped or files (default: %(default)s)")
     parser.add_argument("--seed", metavar="N", type=int, default=1, help="of the losses (default: %(default)s)")
-    parser.add_argument("--out", metavar="FILE.svg", type=Path, help=f"draw PSNR over time ({', '.join(DRAWN)}) into a file")
+    drawn = ", ".join(DRAWN).replace("%", "%%")  # argparse would fill it in
+    parser.add_argument("--out", metavar="FILE.svg", type=Path, help=f"draw PSNR over time ({drawn}) into a file")
     parser.add_argument("--force", action="store_true", help="replace that file if it exists")
     parser.add_argument("--json", action="store_true", help="print one JSON object a row instead of the table")
     parser.add_argument("--debug", action="store_true", help="show where an error came from")
