@@ -125,9 +125,13 @@ def test_signals_stay_the_programs() -> None:
         (mask,) = re.findall(r"^SigCgt:\s+(\w+)$", Path("/proc/self/status").read_text(), re.MULTILINE)
         return [bool(int(mask, 16) >> (signum - 1) & 1) for signum in (signal.SIGINT, signal.SIGTERM)]
 
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which Python leaves alone in what a shell started with &
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    with Window("test"):
-        assert caught() == [True, False]
+    try:
+        with Window("test"):
+            assert caught() == [True, False]
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize("driver", ["x11", None], ids=["asked for", "any"])
