@@ -135,7 +135,7 @@ def upscale(arguments: argparse.Namespace) -> Summary:
             )
         if reference or comparison:
             names = ("bicubic", "lanczos") if reference else ("bicubic",)
-            # The yardstick is one, whatever runs ours: bfloat16 costs bicubic itself up to 0.4 dB of chroma.
+            # The yardstick is one, whatever runs ours: what a runtime's precision costs must not be taken from it as well.
             baselines = Baselines(names, scale, provider="cpu", threads=arguments.threads)
         (detail or upscaler).warm_up(source.height, source.width)
         if skipping:
