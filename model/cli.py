@@ -25,6 +25,7 @@ from model.catalogue import NAMES
 from model.evaluate import evaluate, table
 from model.export import BASELINES, export_baseline, export_network
 from model.footage import Degradation, FootageCache, load_scenes
+from model.losses import LOSSES
 from model.stability import CASES, CLIP_FRAMES, HEADER, run_cases, table_row
 from model.train import TrainConfig, Trainer, load_checkpoint, network_of
 from model.trial import SHOWN_STEPS, Subject, bounds_of, broken_by
@@ -81,6 +82,12 @@ def train_main(argv: Sequence[str] | None = None) -> int:
     ):
         parser.add_argument(f"--{name}", type=int, default=defaults[name], help=f"{text} (default: %(default)s)")
     parser.add_argument("--learning-rate", type=float, default=defaults["learning_rate"], help="AdamW's first rate (default: %(default)s)")
+    parser.add_argument(
+        "--loss",
+        choices=LOSSES,
+        default=defaults["loss"],
+        help="charbonnier, the paper's, sums errors up; psnr their logarithms by clip and plane (default: %(default)s)",
+    )
     parser.add_argument("--bfloat16", action="store_true", help="mixed precision: about twice as fast on AMX CPUs and on GPUs")
     parser.add_argument(
         "--initial-weights", default="", metavar="CHECKPOINT", help="start from another run's checkpoint.pt, as far as shapes fit"

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 from client.errors import InputError, ModelError
 from model.catalogue import NAMES, described_network, network_of_preset
 from model.footage import Degradation, FootageCache, Pair, by_game, load_pairs, load_scenes, sample_clips
+from model.losses import LOSSES, charbonnier, mean_log_mse
 from model.planes import Network, Planes, State
 
 CHECKPOINT_FORMAT = 1
@@ -48,6 +48,7 @@ class TrainConfig:
     halvings: int = 6
     warm_up_steps: int = 100
     weight_decay: float = 1e-4
+    loss: str = "charbonnier"
     charbonnier_eps: float = 1e-3
     clip_norm: float = 1.0
     seed: int = 0
@@ -57,6 +58,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         if self.preset not in NAMES:
             raise InputError(f"no network is called {self.preset!r}: there are {', '.join(NAMES)}")
+        if self.loss not in LOSSES:
+            raise InputError(f"no loss is called {self.loss!r}: there are {', '.join(LOSSES)}")
         if self.frames % self.window or self.patch % 2:
             raise InputError("the clip length must be a multiple of the window, and the patch even")
 
@@ -67,13 +70,6 @@ class TrainConfig:
     def rate_at(self, step: int) -> float:
         warm = min(1.0, (step + 1) / self.warm_up_steps)
         return self.learning_rate * warm * 0.5 ** int((self.halvings + 1) * step / self.steps)
-
-
-def charbonnier(output: Planes, target: Planes, eps: float) -> Tensor:
-    """Mean of sqrt(d^2 + eps^2) over all samples of all planes, d in units of the code range (paper, section 4.1)."""
-    total = sum(((a - b).div(255).square() + eps * eps).sqrt().sum() for a, b in zip(output, target, strict=True))
-    assert isinstance(total, Tensor)
-    return total / sum(plane.numel() for plane in target)
 
 
 def to_planes(arrays: list[np.ndarray], device: torch.device) -> Planes:
@@ -183,7 +179,7 @@ class Trainer:
             group["lr"] = self.config.rate_at(self.step)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.bfloat16):
             output, state = self.forward(low, state)
-        loss = charbonnier(output, high, self.config.charbonnier_eps)
+        loss = mean_log_mse(output, high) if self.config.loss == "psnr" else charbonnier(output, high, self.config.charbonnier_eps)
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip_norm)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from client.errors import InputError, ModelError
 from client.frames import Frame
 from model.cli import train_main
 from model.footage import Degradation, FootageCache, by_game, load_pairs, load_scenes, sample_clips
+from model.losses import LOSSES, mean_log_mse
+from model.planes import Planes
 from model.train import TrainConfig, Trainer, load_checkpoint, network_of
 from tests.moving import picture, write_footage
 
@@ -39,6 +42,27 @@ def test_a_resumed_run_ends_at_the_same_weights(footage: Path, tmp_path: Path) -
     assert whole["step"] == parts["step"] == 8
     for name, weight in whole["network"].items():
         assert torch.equal(weight, parts["network"][name]), name
+
+
+def test_the_psnr_loss_is_psnr_yuv_of_the_clips_turned_round() -> None:
+    random = np.random.default_rng(0)
+    shapes = ((3, 2, 1, 8, 12), (3, 2, 1, 4, 6), (3, 2, 1, 4, 6))
+    target = [random.uniform(0, 255, shape) for shape in shapes]
+    output = [plane + random.normal(0, 3 + n, plane.shape) for n, plane in enumerate(target)]
+    y, u, v = (10 * np.log10(255**2 / np.square(a - b).mean((1, 2, 3, 4))) for a, b in zip(output, target, strict=True))
+    psnr_yuv = np.mean((6 * y + u + v) / 8)
+    loss = mean_log_mse(*(Planes(*map(torch.from_numpy, planes)) for planes in (output, target)))
+    assert 10 * math.log10(255**2) - 10 / math.log(10) * loss.item() == pytest.approx(psnr_yuv, abs=0.05)  # but for the floor
+
+
+def test_the_losses_train_different_weights_and_no_other_is_taken(footage: Path, tmp_path: Path) -> None:
+    cache = FootageCache(tmp_path / "cache")
+    trainers = [Trainer(TrainConfig(**{**TINY.__dict__, "loss": loss}), footage, cache, tmp_path / loss) for loss in LOSSES]
+    for trainer in trainers:
+        assert all(map(np.isfinite, trainer.losses()))
+    assert not torch.equal(*(trainer.network.head.weight for trainer in trainers))
+    with pytest.raises(InputError, match="no loss is called 'ssim': there are charbonnier, psnr"):
+        TrainConfig(loss="ssim")
 
 
 def test_a_run_may_start_from_the_weights_of_another_scale(footage: Path, tmp_path: Path) -> None:
