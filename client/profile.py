@@ -20,7 +20,7 @@ from client.artifact import ModelSpec, load_session, read_artifact, session_opti
 from client.cores import physical_cores
 from client.errors import GamesrError
 from client.models import DEFAULT_MODEL, find_model
-from client.runtime import BFLOAT16, OPENVINO, OpenVinoRuntime
+from client.runtime import OPENVINO, OpenVinoRuntime
 from client.upscaler import plane_shapes
 
 PROGRAM = "gamesr-profile"
@@ -92,7 +92,7 @@ def _onnxruntime_runs(content: bytes, spec: ModelSpec, inputs: Arrays, count: in
 
 
 def _openvino_runs(content: bytes, spec: ModelSpec, inputs: Arrays, count: int, threads: int, provider: str) -> Iterator[list[Part]]:
-    runtime = OpenVinoRuntime(content, threads=threads, bfloat16=provider == BFLOAT16, counting=True)
+    runtime = OpenVinoRuntime(content, threads=threads, provider=provider, counting=True)
     request = runtime.request({name: array.shape for name, array in inputs.items()})
     for _ in range(count):
         request.infer(inputs)

@@ -17,7 +17,9 @@ from client.errors import ModelError, ProviderError
 
 Array = NDArray[np.generic]
 BFLOAT16 = "openvino-bfloat16"
-OPENVINO = ("openvino", BFLOAT16)
+FLOAT16 = "openvino-float16"
+OPENVINO = {"openvino": "f32", BFLOAT16: "bf16", FLOAT16: "f16"}  # providers, by what OpenVINO calls what they compute in
+CAPABILITIES = {"f32": "FP32", "bf16": "BF16", "f16": "FP16"}  # what it says of a processor that computes in it
 PROVIDERS = (*ORT_PROVIDERS, *OPENVINO)
 MAX_COMPILED_SIZES = 4
 
@@ -62,7 +64,7 @@ def load_runtime(model: Path, provider: str, threads: int) -> tuple[Runtime, Mod
         return OrtRuntime(session, "cuda" if provider == "cuda" else "cpu"), spec
     openvino()  # whether it is there is said before anything is read
     _, spec = load_session(model, "cpu", 1)
-    return OpenVinoRuntime(read_artifact(model), threads=threads, bfloat16=provider == BFLOAT16), spec
+    return OpenVinoRuntime(read_artifact(model), threads=threads, provider=provider), spec
 
 
 class OrtRuntime:
@@ -112,20 +114,21 @@ def openvino() -> ModuleType:
 class OpenVinoRuntime:
     """A graph compiled by OpenVINO for every size that it is used at, since fixed sizes save a third of a small network's time.
 
-    With `bfloat16` the inner layers compute in it; inputs, outputs and the state stay as they are. With `counting` a request
-    knows what each operation took. Raises ProviderError where the processor has no bfloat16.
+    `provider` is one of OPENVINO: the inner layers compute in its precision; inputs, outputs and the state stay as they are. With
+    `counting` a request knows what each operation took. Raises ProviderError where the processor does not have the precision.
     """
 
     has_own_memory = False
 
-    def __init__(self, content: bytes, *, threads: int, bfloat16: bool, counting: bool = False) -> None:
+    def __init__(self, content: bytes, *, threads: int, provider: str, counting: bool = False) -> None:
         self._ov = openvino()
         self._core = self._ov.Core()
-        if bfloat16 and "BF16" not in self._core.get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
-            raise ProviderError("this processor does not compute in bfloat16: use --provider openvino")
+        precision = OPENVINO[provider]
+        if CAPABILITIES[precision] not in self._core.get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
+            raise ProviderError(f"this processor does not compute in {provider.removeprefix('openvino-')}: use --provider openvino")
         self._content = content
         self._options = {
-            "INFERENCE_PRECISION_HINT": "bf16" if bfloat16 else "f32",
+            "INFERENCE_PRECISION_HINT": precision,
             "INFERENCE_NUM_THREADS": threads,
             "NUM_STREAMS": 1,
             "PERF_COUNT": counting,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from client.errors import ProviderError
 from client.frames import Frame
-from client.runtime import BFLOAT16, PROVIDERS, is_installed
+from client.runtime import BFLOAT16, FLOAT16, PROVIDERS, is_installed
 from client.upscaler import OnnxUpscaler
 from model.hard_cases import black, hud, noise
 from model.trial import Outcome, Subject, bounds_of, count_subnormals, tally
@@ -120,11 +120,11 @@ def threads(subject: Subject, steps: int) -> Outcome:
 
 
 def providers(subject: Subject, steps: int) -> Outcome:
-    """The same frames through every provider that starts here and rounds nothing to bfloat16: pictures must agree as with the reference."""
+    """The same frames through every provider that starts here and computes in float32: pictures must agree as with the reference."""
     upscalers: list[OnnxUpscaler] = []
     refused: list[str] = []
     for name in PROVIDERS:
-        if name != BFLOAT16 and is_installed(name):
+        if name not in (BFLOAT16, FLOAT16) and is_installed(name):
             try:
                 upscalers.append(OnnxUpscaler(subject.path, provider=name))
             except ProviderError as error:  # a runtime for a GPU where there is none says nothing about the artifact

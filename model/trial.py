@@ -15,7 +15,7 @@ from tqdm import tqdm
 from client.artifact import ModelSpec
 from client.errors import ModelError
 from client.frames import Frame
-from client.runtime import BFLOAT16
+from client.runtime import BFLOAT16, FLOAT16
 from client.timing import LatencySummary
 from client.upscaler import OnnxUpscaler
 from model.planes import Network
@@ -46,6 +46,7 @@ class Bounds:
 # hundred is off by 1e-5 to 1e-4. What was measured, and what the bounds leave above it: docs/stability.md.
 BOUNDS = {
     "float32": Bounds(codes=1, differing=1e-3, state=3e-5, drift=1e-6, flickering=1e-4),
+    "float16": Bounds(codes=1, differing=0.05, state=0.01, drift=1e-4, flickering=1e-4),
     "bfloat16": Bounds(codes=4, differing=0.4, state=0.1, drift=1e-3, flickering=1e-4),
     "int8": Bounds(codes=16, differing=0.5, state=0.2, drift=1e-2, flickering=1e-4),
 }
@@ -53,7 +54,8 @@ BOUNDS = {
 
 def bounds_of(spec: ModelSpec, provider: str) -> Bounds:
     """Those of what it computes in: int8 is the coarsest wherever it runs. Raises ModelError for a precision that has none."""
-    precision = "bfloat16" if (spec.precision, provider) == ("float32", BFLOAT16) else spec.precision
+    coarser = {BFLOAT16: "bfloat16", FLOAT16: "float16"}
+    precision = coarser.get(provider, spec.precision) if spec.precision == "float32" else spec.precision
     if precision not in BOUNDS:
         raise ModelError(f"no bounds are stated for the precision {precision} of {spec.name}")
     return BOUNDS[precision]

@@ -1,4 +1,4 @@
-"""Runtimes: OpenVINO against ONNX Runtime on the same artifacts, state carried, at any size and in its two precisions."""
+"""Runtimes: OpenVINO against ONNX Runtime on the same artifacts, state carried, at any size and in its precisions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from model.export import export_baseline, export_network
 from tests.moving import picture
 from tests.networks import random_network
 
-HAS_BFLOAT16 = "BF16" in openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+HAS = openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
 
 
 @pytest.fixture(scope="module")
@@ -58,14 +58,17 @@ def test_openvino_gives_the_same_pictures(artifacts: dict[str, Path], name: str,
 
 
 @pytest.mark.parametrize("name", ["planes", "balanced", "live"])
-def test_bfloat16_is_near_or_refused_where_the_processor_has_none(artifacts: dict[str, Path], name: str) -> None:
+@pytest.mark.parametrize(("precision", "capability", "largest_rms"), [("bfloat16", "BF16", 1), ("float16", "FP16", 0.3)])
+def test_16_bits_are_near_or_refused_where_the_processor_has_none(
+    artifacts: dict[str, Path], name: str, precision: str, capability: str, largest_rms: float
+) -> None:
     frames = clip_of(12, 48, 64)
-    if not HAS_BFLOAT16:
-        with pytest.raises(ProviderError, match="does not compute in bfloat16"):
-            pictures(artifacts[name], "openvino-bfloat16", frames)
+    if capability not in HAS:
+        with pytest.raises(ProviderError, match=f"does not compute in {precision}"):
+            pictures(artifacts[name], f"openvino-{precision}", frames)
         return
-    found = difference(pictures(artifacts[name], "openvino-bfloat16", frames), pictures(artifacts[name], "cpu", frames))
-    assert found.any() and np.sqrt(np.square(found.astype(float)).mean()) < 1
+    found = difference(pictures(artifacts[name], f"openvino-{precision}", frames), pictures(artifacts[name], "cpu", frames))
+    assert np.sqrt(np.square(found.astype(float)).mean()) < largest_rms
 
 
 def test_more_sizes_than_are_kept_and_streams_that_take_turns(artifacts: dict[str, Path]) -> None:
@@ -98,4 +101,4 @@ def test_without_openvino_it_says_what_to_install(artifacts: dict[str, Path]) ->
 
 def test_what_openvino_cannot_compile_is_one_sentence() -> None:
     with pytest.raises(ModelError, match="OpenVINO cannot compile the model"):
-        OpenVinoRuntime(b"text", threads=1, bfloat16=False).binding({"y": (1, 1, 4, 4)})
+        OpenVinoRuntime(b"text", threads=1, provider="openvino").binding({"y": (1, 1, 4, 4)})
