@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import onnx
+import onnxruntime as ort
 import pytest
 import torch
 
@@ -60,6 +61,24 @@ def test_the_artifact_says_what_it_is(artifacts: dict[str, Path]) -> None:
     assert [(s.input, s.output, s.channels, s.divisor) for s in spec.state] == [("h_in", "h_out", 32, 2), ("c_in", "c_out", 32, 2)]
     assert spec.card["parameters"] == 141_607
     assert OnnxUpscaler(artifacts["planes-no-lstm_x2"], threads=1).spec.state == ()
+
+
+@pytest.mark.parametrize("name", ["paper_x2", "planes_x2"])
+def test_the_check_of_a_state_is_no_larger_than_the_state(artifacts: dict[str, Path], name: str) -> None:
+    """A sum over a frame's cells would leave float16 at 960x540; and one NaN or Inf anywhere must show."""
+    session = ort.InferenceSession(artifacts[name])
+    y, u, v = (np.zeros((1, 1, side, side), np.uint8) for side in (64, 32, 32))
+    divisor = OnnxUpscaler(artifacts[name], threads=1).spec.state[0].divisor
+    state = np.full((1, 32, 64 // divisor, 64 // divisor), 30, np.float32)
+
+    def check(cell: np.ndarray) -> float:
+        return float(session.run(["state_sum"], {"y": y, "u": u, "v": v, "h_in": state, "c_in": cell})[0])
+
+    assert 0 < abs(check(state)) <= 1 + 31  # the mean of a hidden state, a tanh's, and of a cell, which grows by 1
+    for wrong in (np.nan, np.inf):
+        cell = state.copy()
+        cell[0, 7, 3, 2] = wrong
+        assert not np.isfinite(check(cell))
 
 
 @pytest.mark.parametrize("name", ["planes_x2", "balanced_x2"])
