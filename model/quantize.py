@@ -24,15 +24,11 @@ from client.errors import InputError, ModelError
 from client.frames import Frame
 from client.upscaler import OnnxUpscaler, copy_padded, plane_shapes
 from client.video import read_frames
-from model.hard_cases import lines, noise, text
 from model.lean import ARCHITECTURE, CELL
 
 # Not the gates, whose error the state would keep; not what interpolates, which makes the code values themselves; and not a head
 # whose base is apart: a residual of rare large values in 8 bits is what lost most, and such a head is a twentieth of the work.
 QUANTIZED = re.compile(r"network\.(stem|blocks\.\d+(\.conv)?|head\.features)\.weight")
-# Few clips have features as large as letters and one-pixel lines make them: cut off there, text came out 28 codes wrong.
-MADE = (lines, text, noise)
-MADE_SIZE = (160, 96)
 CALIBRATION_FRAMES = 8
 
 CODES, MIDDLE = "codes_about_zero", 128
@@ -45,10 +41,10 @@ def quantize(artifact: Path, path: Path, clips: Sequence[Path], *, name: str, fr
     """Write an int8 artifact; its card, which is returned, says what it was made from and calibrated on.
 
     `clips` are videos of the artifact's input, low resolution and compressed as they will be; the ranges of the features are
-    the smallest and the largest value in the first `frames` frames of each, the state carried by the float network, and in a frame
-    of each of `MADE`. Weights are symmetric, a scale for each output channel, features unsigned with one scale and zero point for
-    a tensor: signed ones take twice as long in both runtimes. Raises ModelError for an artifact that is not a float32 network of
-    ours and InputError for a clip without frames.
+    the smallest and the largest value in the first `frames` frames of each, the state carried by the float network. Weights
+    are symmetric, a scale for each output channel, features unsigned with one scale and zero point for a tensor: signed ones
+    take twice as long in both runtimes. Raises ModelError for an artifact that is not a float32 network of ours and InputError
+    for a clip without frames.
     """
     upscaler = OnnxUpscaler(artifact)
     model = onnx.load(artifact)
@@ -110,11 +106,6 @@ class _Footage(CalibrationDataReader):  # type: ignore[misc]
             if state is None:
                 raise InputError(f"no frame of {clip} could be decoded")
             self.played.append(f"{clip.name} ({count} frames)")
-        for made in MADE:
-            frame = next(made(*MADE_SIZE, 1))
-            zeros = upscaler.initial_state(frame.height, frame.width).tensors()
-            yield {**_planes(frame, upscaler.spec), **{s.input: t.copy() for s, t in zip(upscaler.spec.state, zeros, strict=True)}}
-            self.played.append(f"made {made.__name__} (1 frame)")
 
 
 def _planes(frame: Frame, spec: ModelSpec) -> dict[str, NDArray[np.generic]]:

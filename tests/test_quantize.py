@@ -61,9 +61,8 @@ def played(model: Path, frames: list[Frame], provider: str) -> Iterator[Frame]:
 
 @pytest.mark.parametrize("name", NETWORKS)
 @pytest.mark.parametrize("provider", ["cpu", "openvino"])
-@pytest.mark.parametrize("of", ["a moving picture", "letters, which no clip had"])
-def test_int8_comes_near_the_float32_artifact(folder: Path, name: str, provider: str, of: str) -> None:
-    frames = list(hard_cases.text(144, 96, 20)) if of.startswith("letters") else [picture(t, 96, 144) for t in range(20)]
+def test_int8_comes_near_the_float32_artifact(folder: Path, name: str, provider: str) -> None:
+    frames = [picture(t, 96, 144) for t in range(20)]
     bicubic = folder / "bicubic.onnx"
     export_baseline("bicubic", 2, bicubic)
     for plane in "yuv":
@@ -71,7 +70,7 @@ def test_int8_comes_near_the_float32_artifact(folder: Path, name: str, provider:
             np.stack([getattr(p, plane) for p in played(model, frames, by)]).astype(float)
             for model, by in ((folder / f"{name}-int8.onnx", provider), (folder / f"{name}.onnx", "cpu"), (bicubic, "cpu"))
         )
-        assert 0 < np.square(rounded - exact).mean() < 0.03 * np.square(exact - nothing).mean(), plane
+        assert 0 < np.square(rounded - exact).mean() < 0.01 * np.square(exact - nothing).mean(), plane
 
 
 def test_codes_keep_their_numbers_and_what_is_added_to_the_interpolation_stays_float(folder: Path) -> None:
@@ -109,8 +108,7 @@ def test_it_is_the_same_model_to_the_client_but_for_its_precision(folder: Path, 
     ours, theirs = (OnnxUpscaler(folder / f"{stem}.onnx", threads=1).spec for stem in (f"{name}-int8", name))
     assert (ours.name, ours.precision, theirs.precision) == (f"{name}-int8", "int8", "float32")
     assert (ours.scale, ours.size_multiple, ours.state, ours.reach) == (theirs.scale, theirs.size_multiple, theirs.state, theirs.reach)
-    made = [f"made {what} (1 frame)" for what in ("lines", "text", "noise")]
-    assert ours.card == {**theirs.card, "quantized_from": theirs.sha256, "calibration": ["clip.mkv (6 frames)", *made]}
+    assert ours.card == {**theirs.card, "quantized_from": theirs.sha256, "calibration": ["clip.mkv (6 frames)"]}
 
 
 def test_without_the_cells_in_its_layers_it_is_the_same_network(folder: Path, tmp_path: Path) -> None:
