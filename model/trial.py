@@ -46,7 +46,7 @@ class Bounds:
 # hundred is off by 1e-5 to 1e-4. What was measured, and what the bounds leave above it: docs/stability.md.
 BOUNDS = {
     "float32": Bounds(codes=1, differing=1e-3, state=3e-5, drift=1e-6, flickering=1e-4),
-    "float16": Bounds(codes=1, differing=0.05, state=0.02, drift=1e-4, flickering=1e-4),
+    "float16": Bounds(codes=1, differing=0.05, state=0.01, drift=1e-4, flickering=1e-4),
     "bfloat16": Bounds(codes=4, differing=0.4, state=0.1, drift=1e-3, flickering=1e-4),
     "int8": Bounds(codes=16, differing=0.5, state=0.2, drift=1e-2, flickering=1e-4),
 }
