@@ -19,6 +19,8 @@ from model.interpolation import MIDDLES, Interpolation, LearnedInterpolation, ch
 from model.planes import INPUT_GAIN, RESIDUAL_GAIN, Network, Planes, State
 from model.reparam import LinearTriple
 
+CELL_BOUND = 32.0  # tanh is 1 to float32's last bit from 9 on; 32 frames from zeros cannot reach it
+
 
 @dataclass(frozen=True)
 class NetworkConfig:
@@ -73,7 +75,10 @@ class FeatureBlock(nn.Module):
 
 
 class ConvLstm(nn.Module):
-    """A ConvLSTM cell whose four gates are one convolution over [x, h] (Shi et al. 2015, eq. 3, without peepholes)."""
+    """A ConvLSTM cell whose four gates are one convolution over [x, h] (Shi et al. 2015, eq. 3, without peepholes).
+
+    Ours is that no cell goes beyond CELL_BOUND: one that is never told to forget grows by up to 1 a frame, for as long as the stream runs.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -85,6 +90,7 @@ class ConvLstm(nn.Module):
     def forward(self, x: Tensor, state: State) -> State:
         i, f, o, g = self.gates(torch.cat((x, state.h), 1)).chunk(4, 1)
         c = torch.sigmoid(f) * state.c + torch.sigmoid(i) * torch.tanh(g)
+        c = c.clamp(-CELL_BOUND, CELL_BOUND) + 0 * c  # a clamp alone hides NaN and Inf, which the client must see
         return State(torch.sigmoid(o) * torch.tanh(c), c)
 
 

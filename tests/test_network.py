@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from model.complexity import parameter_count
-from model.network import PRESETS, GameSR, NetworkConfig
+from model.network import CELL_BOUND, PRESETS, ConvLstm, GameSR, NetworkConfig
 from model.planes import Planes, State
 from model.reparam import fuse
 from tests.networks import random_clip, random_network
@@ -92,3 +92,24 @@ def test_the_form_that_runs_gives_the_same_picture_to_the_border(preset: str, sc
 def test_a_planes_network_needs_an_even_unshuffle() -> None:
     with pytest.raises(ValueError, match="even unshuffle"):
         NetworkConfig(colour="planes", unshuffle=1)
+
+
+def test_a_cell_that_never_forgets_grows_by_one_a_frame_up_to_the_bound() -> None:
+    lstm = ConvLstm(2)
+    with torch.no_grad():
+        lstm.gates.weight.zero_()
+        lstm.gates.bias.copy_(torch.tensor([100.0, 100, 100, 100, 0, 0, 100, -100]))  # all let in, nothing forgotten; one up, one down
+        x = torch.zeros(1, 2, 3, 3)
+        state = State(x, x)
+        for step in range(1, 41):
+            state = lstm(x, state)
+            grown = torch.full((1, 1, 3, 3), min(step, CELL_BOUND))
+            assert torch.equal(state.c, torch.cat((grown, -grown), 1))
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
+def test_a_lost_cell_is_not_hidden_by_its_bound(bad: float) -> None:
+    state = State(*(torch.zeros(1, 2, 3, 3) for _ in range(2)))
+    state.c[0, 1, 2, 0] = bad
+    found = ConvLstm(2)(torch.zeros(1, 2, 3, 3), state).c.isfinite()
+    assert not found[0, 1, 2, 0] and found.sum() == found.numel() - 1
