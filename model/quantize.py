@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import logging
 import os
 import re
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
@@ -15,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import onnx
-from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
 
@@ -24,15 +24,23 @@ from client.errors import InputError, ModelError
 from client.frames import Frame
 from client.upscaler import OnnxUpscaler, copy_padded, plane_shapes
 from client.video import read_frames
+from model.calibration import Feeds, even_channels, mean_difference
+from model.hard_cases import lines, noise, text
 from model.lean import ARCHITECTURE, CELL
 
 # Not the gates, whose error the state would keep; not what interpolates, which makes the code values themselves; and not a head
 # whose base is apart: a residual of rare large values in 8 bits is what lost most, and such a head is a twentieth of the work.
 QUANTIZED = re.compile(r"network\.(stem|blocks\.\d+(\.conv)?|head\.features)\.weight")
+# Few clips have features as large as letters, one-pixel lines and stripes of any colours make them (noise two samples wide is
+# stripes, as the edges go on): cut off there, lines came out 36 codes wrong.
+Made = tuple[Callable[[int, int, int], Iterator[Frame]], int, int]
+MADE: tuple[Made, ...] = ((lines, 160, 96), (text, 160, 96), (noise, 160, 96), (noise, 160, 2), (noise, 2, 96))
+MADE_FRAMES = 16
 CALIBRATION_FRAMES = 8
 
 CODES, MIDDLE = "codes_about_zero", 128
 RESIDUAL = "residual"  # what the head makes of the features, in codes
+CELLS_BIAS = "network.head.cells.bias"  # what 8 bits take from that in the mean (Nagel et al. 2019, section 4.2)
 
 JOINING = ("Relu", "LeakyRelu", "Add")
 
@@ -41,10 +49,11 @@ def quantize(artifact: Path, path: Path, clips: Sequence[Path], *, name: str, fr
     """Write an int8 artifact; its card, which is returned, says what it was made from and calibrated on.
 
     `clips` are videos of the artifact's input, low resolution and compressed as they will be; the ranges of the features are
-    the smallest and the largest value in the first `frames` frames of each, the state carried by the float network. Weights
-    are symmetric, a scale for each output channel, features unsigned with one scale and zero point for a tensor: signed ones
-    take twice as long in both runtimes. Raises ModelError for an artifact that is not a float32 network of ours and InputError
-    for a clip without frames.
+    the smallest and the largest value in the first `frames` frames of each, the state carried by the float network, and in
+    `MADE_FRAMES` frames of each of `MADE`. Weights are symmetric, a scale for each output channel, features unsigned with one scale
+    and zero point for a tensor (signed ones take twice as long in both runtimes), of which every channel is made to use all
+    (`even_channels`). What 8 bits do to the mean of the clips' pictures is taken back where the layers carry the cells. Raises
+    ModelError for an artifact that is not a float32 network of ours and InputError for a clip without frames.
     """
     upscaler = OnnxUpscaler(artifact)
     model = onnx.load(artifact)
@@ -54,13 +63,15 @@ def quantize(artifact: Path, path: Path, clips: Sequence[Path], *, name: str, fr
     nodes = _quantized_nodes(model.graph)
     if not nodes:
         raise ModelError(f"{artifact} has no layer that is quantized: it is no GameSR network")
+    exact = [RESIDUAL, *(node.input[0] for node in model.graph.node if node.op_type == "LeakyRelu")]
     metadata = {entry.key: entry.value for entry in model.metadata_props}
-    footage = _Footage(upscaler, clips, frames)
+    footage = _Footage(upscaler, clips, frames, MADE)
+    even_channels(model, footage)
     with tempfile.TemporaryDirectory(prefix="gamesr-quantize-") as folder:
         whole = Path(folder) / "int8.onnx"
         with _quiet_quantizer():
             quantize_static(
-                model,
+                copy.deepcopy(model),  # whose tensors it moves to files
                 whole,
                 footage,
                 op_types_to_quantize=["Conv", *JOINING],
@@ -71,7 +82,11 @@ def quantize(artifact: Path, path: Path, clips: Sequence[Path], *, name: str, fr
                 extra_options={"TensorQuantOverrides": exact_codes(model.graph)},
             )
         quantized = onnx.load(whole)
-    leave_float(quantized.graph, RESIDUAL)
+    for tensor in exact:
+        leave_float(quantized.graph, tensor)
+    if bias := next((tensor for tensor in quantized.graph.initializer if tensor.name == CELLS_BIAS), None):
+        lost = mean_difference(model, quantized, RESIDUAL, _Footage(upscaler, clips, frames))
+        bias.CopyFrom(numpy_helper.from_array(lost.astype(np.float32), CELLS_BIAS))
     card = {**upscaler.spec.card, "quantized_from": upscaler.spec.sha256, "calibration": footage.played}
     helper.set_model_props(quantized, {**metadata, "name": name, "precision": "int8", "card": json.dumps(card)})
     onnx.checker.check_model(quantized, full_check=True)
@@ -82,22 +97,26 @@ def quantize(artifact: Path, path: Path, clips: Sequence[Path], *, name: str, fr
 
 
 class _Footage(CalibrationDataReader):  # type: ignore[misc]
-    """The inputs of the graph, frame by frame: planes, and the state that the float network has come to.
+    """The inputs of the graph, frame by frame: planes, and the state that the float network has come to; anew whenever gone through.
 
     `played` says which clips are through, and how many of their frames that were.
     """
 
-    def __init__(self, upscaler: OnnxUpscaler, clips: Sequence[Path], frames: int) -> None:
+    def __init__(self, upscaler: OnnxUpscaler, clips: Sequence[Path], most: int, made: Sequence[Made] = ()) -> None:
         self.played: list[str] = []
-        self._inputs = self._play(upscaler, clips, frames)
+        self._upscaler, self._clips, self._most, self._made = upscaler, clips, most, made
+        self._inputs = iter(self)
 
-    def get_next(self) -> dict[str, NDArray[np.generic]] | None:
+    def get_next(self) -> Feeds | None:
+        """What the quantizer asks for: once through."""
         return next(self._inputs, None)
 
-    def _play(self, upscaler: OnnxUpscaler, clips: Sequence[Path], most: int) -> Iterator[dict[str, NDArray[np.generic]]]:
-        for clip in clips:
+    def __iter__(self) -> Iterator[Feeds]:
+        upscaler = self._upscaler
+        self.played.clear()
+        for clip in self._clips:
             state, count = None, 0
-            for frame in islice(read_frames(clip), most):
+            for frame in islice(read_frames(clip), self._most):
                 state = state or upscaler.initial_state(frame.height, frame.width)
                 remembered = [tensor.copy() for tensor in state.tensors()]
                 yield {**_planes(frame, upscaler.spec), **{s.input: t for s, t in zip(upscaler.spec.state, remembered, strict=True)}}
@@ -106,9 +125,14 @@ class _Footage(CalibrationDataReader):  # type: ignore[misc]
             if state is None:
                 raise InputError(f"no frame of {clip} could be decoded")
             self.played.append(f"{clip.name} ({count} frames)")
+        for made, width, height in self._made:
+            for frame in made(width, height, MADE_FRAMES):
+                zeros = upscaler.initial_state(frame.height, frame.width).tensors()
+                yield {**_planes(frame, upscaler.spec), **{s.input: t.copy() for s, t in zip(upscaler.spec.state, zeros, strict=True)}}
+            self.played.append(f"made {made.__name__}, {width}x{height} ({MADE_FRAMES} frames)")
 
 
-def _planes(frame: Frame, spec: ModelSpec) -> dict[str, NDArray[np.generic]]:
+def _planes(frame: Frame, spec: ModelSpec) -> Feeds:
     shapes = plane_shapes(spec.padded(frame.height), spec.padded(frame.width))
     padded = [np.empty(shape, np.uint8) for shape in shapes]
     for plane, target in zip((frame.y, frame.u, frame.v), padded, strict=True):
@@ -155,6 +179,7 @@ def split_carried_cells(graph: onnx.GraphProto, spec: ModelSpec) -> None:
     new = {
         "network.head.features.weight": weight[:, :features],
         "network.head.cells.weight": weight[:, features:],
+        CELLS_BIAS: np.zeros(len(weight), np.float32),
         "middle": np.array(MIDDLE, np.float32),
         "starts": np.array([cut, cut]),
         "ends": np.array([-cut, -cut]),
@@ -169,7 +194,7 @@ def split_carried_cells(graph: onnx.GraphProto, spec: ModelSpec) -> None:
         head.name: [
             helper.make_node("Conv", [source, "network.head.features.weight", head.input[2]], [RESIDUAL], name=RESIDUAL),
             helper.make_node("Slice", [cells, "starts", "ends", "axes"], ["head_source"], name="head_source"),
-            helper.make_node("Conv", ["head_source", "network.head.cells.weight"], ["head_cells"], name="head_cells"),
+            helper.make_node("Conv", ["head_source", "network.head.cells.weight", CELLS_BIAS], ["head_cells"], name="head_cells"),
             helper.make_node("Add", [RESIDUAL, "head_cells"], list(head.output), name="head"),
         ]
     }
@@ -186,7 +211,11 @@ def exact_codes(graph: onnx.GraphProto) -> dict[str, list[dict[str, Any]]]:
 
 
 def leave_float(graph: onnx.GraphProto, tensor: str) -> None:
-    """Take a tensor's 8 bits away, in place: with one step for the residual of Y, U and V, half a code of U would be lost."""
+    """Take a tensor's 8 bits away, in place.
+
+    With one step for the residual of Y, U and V half a code of U would be lost. Before a leaky ReLU the negative side is ten times as
+    wide as behind it and takes most of the 256 steps; OpenVINO fuses the ReLU into the convolution, so they would cost time besides.
+    """
     down = next((node for node in graph.node if node.op_type == "QuantizeLinear" and node.input[0] == tensor), None)
     if down is None:
         return
@@ -195,6 +224,9 @@ def leave_float(graph: onnx.GraphProto, tensor: str) -> None:
         node.input[:] = [tensor if name == up.output[0] else name for name in node.input]
     graph.node.remove(down)
     graph.node.remove(up)
+    used = {name for node in graph.node for name in node.input}
+    for parameter in [t for t in graph.initializer if t.name in down.input and t.name not in used]:
+        graph.initializer.remove(parameter)
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from client.errors import InputError, ModelError
 from client.frames import Frame
 from client.upscaler import OnnxUpscaler
 from model import hard_cases
+from model.calibration import even_channels, mean_difference, observed
 from model.cli import export_main, train_main, verify_main
 from model.export import export_baseline, export_network
 from model.lean import Lean, LeanConfig
@@ -22,6 +23,7 @@ from model.network import GameSR, NetworkConfig
 from model.planes import Network
 from model.quantize import CODES, RESIDUAL, quantize, split_carried_cells
 from model.quantize_cli import main
+from model.trial import BOUNDS
 from tests.moving import picture, write_footage
 
 NETWORKS: dict[str, Callable[[], Network]] = {  # one without a state whose layers carry the cells, and one with a state whose base is apart
@@ -49,6 +51,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def codes(model: Path, frames: list[Frame], provider: str = "cpu") -> np.ndarray:
     """All samples of all pictures in one row."""
     return np.concatenate([plane.ravel() for p in played(model, frames, provider) for plane in (p.y, p.u, p.v)]).astype(np.int16)
+
+
+def planes(frame: Frame) -> dict[str, np.ndarray]:
+    """What the graph of a network without a state takes."""
+    return {name: getattr(frame, name)[None, None] for name in "yuv"}
+
+
+def channel_min(tensor: np.ndarray) -> np.ndarray:
+    return np.asarray(tensor.min((0, 2, 3)))
+
+
+def channel_max(tensor: np.ndarray) -> np.ndarray:
+    return np.asarray(tensor.max((0, 2, 3)))
 
 
 def played(model: Path, frames: list[Frame], provider: str) -> Iterator[Frame]:
@@ -79,6 +94,9 @@ def test_codes_keep_their_numbers_and_what_is_added_to_the_interpolation_stays_f
     (codes_down,) = (node for node in graph.node if node.op_type == "QuantizeLinear" and node.input[0] == CODES)
     assert (tensors[codes_down.input[1]], tensors[codes_down.input[2]]) == (1, 128)
     assert [node.op_type for node in graph.node if RESIDUAL in node.input] == ["Add"]
+    source = {node.output[0]: node.op_type for node in graph.node}
+    assert {source[node.input[0]] for node in graph.node if node.op_type == "LeakyRelu"} == {"Conv"}
+    assert not {name for name in tensors if name.endswith(("_scale", "_zero_point"))} - {name for n in graph.node for name in n.input}
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -108,7 +126,8 @@ def test_it_is_the_same_model_to_the_client_but_for_its_precision(folder: Path, 
     ours, theirs = (OnnxUpscaler(folder / f"{stem}.onnx", threads=1).spec for stem in (f"{name}-int8", name))
     assert (ours.name, ours.precision, theirs.precision) == (f"{name}-int8", "int8", "float32")
     assert (ours.scale, ours.size_multiple, ours.state, ours.reach) == (theirs.scale, theirs.size_multiple, theirs.state, theirs.reach)
-    assert ours.card == {**theirs.card, "quantized_from": theirs.sha256, "calibration": ["clip.mkv (6 frames)"]}
+    made = [f"made {what} (16 frames)" for what in ("lines, 160x96", "text, 160x96", "noise, 160x96", "noise, 160x2", "noise, 2x96")]
+    assert ours.card == {**theirs.card, "quantized_from": theirs.sha256, "calibration": ["clip.mkv (6 frames)", *made]}
 
 
 def test_without_the_cells_in_its_layers_it_is_the_same_network(folder: Path, tmp_path: Path) -> None:
@@ -121,6 +140,45 @@ def test_without_the_cells_in_its_layers_it_is_the_same_network(folder: Path, tm
     apart = onnx.load(folder / "recurrent.onnx")
     split_carried_cells(apart.graph, OnnxUpscaler(folder / "recurrent.onnx", threads=1).spec)
     assert apart == onnx.load(folder / "recurrent.onnx")
+
+
+def test_channels_made_even_leave_the_network_as_it_is_and_reach_as_far_as_each_other(folder: Path, tmp_path: Path) -> None:
+    before = onnx.load(folder / "carrying.onnx")
+    split_carried_cells(before.graph, OnnxUpscaler(folder / "carrying.onnx", threads=1).spec)
+    even = onnx.load_from_string(before.SerializeToString())
+    feeds = [planes(frame) for frame in hard_cases.noise(48, 32, 3)]
+    even_channels(even, feeds)
+    features = [node.output[0] for node in even.graph.node if node.op_type == "LeakyRelu"]
+    assert len(features) == 3
+    for name in features:
+        low, high = (np.stack([f(seen[name]) for seen in observed(even, [name], feeds)]) for f in (channel_min, channel_max))
+        low, high = low.min(0), high.max(0)
+        np.testing.assert_allclose(np.maximum(high, low * high.max() / low.min()), high.max(), rtol=1e-5)
+        spread = np.stack([channel_max(seen[name]) for seen in observed(before, [name], feeds)]).max(0)
+        assert spread.max() > 1.2 * spread.min()  # they were not so before
+    np.testing.assert_allclose(mean_difference(even, before, RESIDUAL, feeds), 0, atol=1e-4)
+    onnx.save(even, tmp_path / "even.onnx")
+    frames = list(hard_cases.noise(48, 32, 4))
+    error = codes(tmp_path / "even.onnx", frames) - codes(folder / "carrying.onnx", frames)
+    assert np.abs(error).max() <= 1 and np.count_nonzero(error) < 1e-3 * error.size
+
+
+def test_the_mean_difference_is_that_of_each_channel(folder: Path) -> None:
+    model = onnx.load(folder / "carrying.onnx")
+    split_carried_cells(model.graph, OnnxUpscaler(folder / "carrying.onnx", threads=1).spec)
+    other = onnx.load_from_string(model.SerializeToString())
+    bias = next(t for t in other.graph.initializer if t.name == "network.head.bias")
+    shift = np.arange(24, dtype=np.float32)
+    bias.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(bias) - shift, bias.name))
+    feeds = [planes(frame) for size in (48, 64) for frame in hard_cases.noise(size, 32, 2)]
+    np.testing.assert_allclose(mean_difference(model, other, RESIDUAL, feeds), shift, atol=1e-3)
+
+
+@pytest.mark.parametrize("case", ["lines", "text", "noise"])
+def test_lines_and_letters_that_no_clip_had_keep_the_bound_of_int8(folder: Path, case: str) -> None:
+    frames = list(getattr(hard_cases, case)(64, 48, 14))
+    error = codes(folder / "carrying-int8.onnx", frames) - codes(folder / "carrying.onnx", frames)
+    assert 0 < np.abs(error).max() <= BOUNDS["int8"].codes
 
 
 def test_any_size_and_a_lost_state_go_through_it(folder: Path) -> None:
@@ -157,7 +215,7 @@ def test_from_a_checkpoint_to_a_verified_int8_artifact(tmp_path: Path, capsys: p
     page = (tmp_path / "tiny-int8_x2.md").read_text()
     sha256 = OnnxUpscaler(Path(model), threads=1).spec.sha256
     assert (
-        f"- Quantized from the float32 artifact {sha256} (SHA-256) on clip.mkv (12 frames), clip.mkv (12 frames)" in page
+        f"- Quantized from the float32 artifact {sha256} (SHA-256) on clip.mkv (12 frames), clip.mkv (12 frames), made lines" in page
     )  # all there are
     assert "in training), int8; " in page and "before it was quantized" in page
 
