@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -26,10 +27,12 @@ def even_channels(model: onnx.ModelProto, inputs: Iterable[Feeds]) -> None:
     """
     convs = {node.output[0]: node for node in model.graph.node if node.op_type == "Conv"}
     readers = {node.input[0]: node for node in convs.values()}
+    read = Counter(name for node in model.graph.node for name in node.input)
     joined = [
         (convs[node.input[0]], node.output[0], readers[node.output[0]])
         for node in model.graph.node
         if node.op_type == "LeakyRelu" and node.input[0] in convs and node.output[0] in readers
+        if read[node.input[0]] == read[node.output[0]] == 1  # nothing else sees the scale
     ]
     names = [features for _, features, _ in joined]
     lowest: dict[str, Array] = dict.fromkeys(names, np.zeros(1))
@@ -66,7 +69,7 @@ def _even(low: Array, high: Array, gains: Array) -> Array:
     r is what makes the error behind least: a step is proportional to 1 + r, and channel i's error to its divisor and its `gains`,
     the sum of its squared weights there.
     """
-    least = SMALLEST * max(-low.min(), high.max(), np.finfo(np.float32).tiny)
+    least = SMALLEST * (max(-low.min(), high.max()) or 1)
     ways = [np.maximum(np.maximum(high, -low / r), least) for r in RATIOS]
     errors = [(1 + r) ** 2 * (np.square(divisors) @ gains) for r, divisors in zip(RATIOS, ways, strict=True)]
     best: Array = ways[int(np.argmin(errors))]

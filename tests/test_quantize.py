@@ -163,6 +163,22 @@ def test_channels_made_even_leave_the_network_as_it_is_and_reach_as_far_as_each_
     assert np.abs(error).max() <= 1 and np.count_nonzero(error) < 1e-3 * error.size
 
 
+def test_channels_that_something_else_reads_are_left_and_dead_ones_stay_finite(folder: Path) -> None:
+    model = onnx.load(folder / "carrying.onnx")
+    split_carried_cells(model.graph, OnnxUpscaler(folder / "carrying.onnx", threads=1).spec)
+    tensors = {t.name: t for t in model.graph.initializer}
+    for name in ("network.blocks.0.weight", "network.blocks.0.bias"):
+        tensors[name].CopyFrom(numpy_helper.from_array(0 * numpy_helper.to_array(tensors[name]), name))
+    relus = [node for node in model.graph.node if node.op_type == "LeakyRelu"]
+    model.graph.node.append(onnx.helper.make_node("Identity", [relus[2].output[0]], ["another"]))
+    before = {name: numpy_helper.to_array(tensor) for name, tensor in tensors.items()}
+    even_channels(model, [planes(frame) for frame in hard_cases.noise(48, 32, 1)])
+    after = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+    assert np.array_equal(after["network.head.features.weight"], before["network.head.features.weight"])
+    assert not np.array_equal(after["network.stem.weight"], before["network.stem.weight"])
+    assert not after["network.blocks.0.weight"].any() and all(np.isfinite(t).all() for t in after.values() if t.dtype == np.float32)
+
+
 def test_the_mean_difference_is_that_of_each_channel(folder: Path) -> None:
     model = onnx.load(folder / "carrying.onnx")
     split_carried_cells(model.graph, OnnxUpscaler(folder / "carrying.onnx", threads=1).spec)
