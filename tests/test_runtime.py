@@ -62,9 +62,9 @@ def test_openvino_gives_the_same_pictures(artifacts: dict[str, Path], name: str,
 
 
 @pytest.mark.parametrize("name", ["planes", "balanced", "live"])
-@pytest.mark.parametrize(("precision", "capability"), [("bfloat16", "BF16"), ("float16", "FP16")])
+@pytest.mark.parametrize(("precision", "capability", "largest_rms"), [("bfloat16", "BF16", 1), ("float16", "FP16", 0.3)])
 def test_16_bits_are_near_or_refused_where_the_processor_has_none(
-    artifacts: dict[str, Path], name: str, precision: str, capability: str
+    artifacts: dict[str, Path], name: str, precision: str, capability: str, largest_rms: float
 ) -> None:
     frames = clip_of(12, 48, 64)
     if capability not in HAS:
@@ -73,7 +73,7 @@ def test_16_bits_are_near_or_refused_where_the_processor_has_none(
         return
     exact = pictures(artifacts[name], "cpu", frames)
     found = difference(pictures(artifacts[name], f"openvino-{precision}", frames), exact)
-    assert found.any() and rms(found) < 1
+    assert found.any() and rms(found) < largest_rms
     if precision == "float16" and "BF16" in HAS:
         assert rms(found) < rms(difference(pictures(artifacts[name], "openvino-bfloat16", frames), exact))
 

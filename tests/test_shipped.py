@@ -77,4 +77,4 @@ def test_an_int8_model_is_the_float32_one_that_ships_within_its_bounds(name: str
     assert (ours.precision, ours.card["quantized_from"]) == ("int8", theirs.sha256)
     errors = list(parity(rounded, [crop(frame, 96, 72) for frame in references], 8, weights=exact))
     assert 0 < max(error.max_code_error for error in errors) <= BOUNDS["int8"].codes
-    assert psnr_y_db(rounded, references) > psnr_y_db(exact, references) - 0.2  # measured, mean of all scenes: -0.05
+    assert psnr_y_db(rounded, references) > psnr_y_db(exact, references) - 0.1
