@@ -18,6 +18,18 @@ Array = NDArray[np.float64]
 Feeds = dict[str, NDArray[np.generic]]  # what a graph takes, by name
 
 
+def observed(model: onnx.ModelProto, tensors: list[str], inputs: Iterable[Feeds]) -> Iterator[dict[str, NDArray[np.float32]]]:
+    """The named tensors of the graph for each of the inputs."""
+    if not tensors:
+        return
+    opened = onnx.ModelProto()
+    opened.CopyFrom(model)
+    opened.graph.output.extend(onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, None) for name in tensors)
+    session = onnxruntime.InferenceSession(opened.SerializeToString(), providers=["CPUExecutionProvider"])
+    for feeds in inputs:
+        yield dict(zip(tensors, session.run(tensors, feeds), strict=True))
+
+
 def even_channels(model: onnx.ModelProto, inputs: Iterable[Feeds]) -> None:
     """Scale the channels between convolutions that a leaky ReLU joins, in place; the network computes what it did.
 
@@ -74,15 +86,3 @@ def _even(low: Array, high: Array, gains: Array) -> Array:
     errors = [(1 + r) ** 2 * (np.square(divisors) @ gains) for r, divisors in zip(RATIOS, ways, strict=True)]
     best: Array = ways[int(np.argmin(errors))]
     return best
-
-
-def observed(model: onnx.ModelProto, tensors: list[str], inputs: Iterable[Feeds]) -> Iterator[dict[str, NDArray[np.float32]]]:
-    """The named tensors of the graph for each of the inputs."""
-    if not tensors:
-        return
-    observed = onnx.ModelProto()
-    observed.CopyFrom(model)
-    observed.graph.output.extend(onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, None) for name in tensors)
-    session = onnxruntime.InferenceSession(observed.SerializeToString(), providers=["CPUExecutionProvider"])
-    for feeds in inputs:
-        yield dict(zip(tensors, session.run(tensors, feeds), strict=True))

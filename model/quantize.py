@@ -31,18 +31,18 @@ from model.lean import ARCHITECTURE, CELL
 # Not the gates, whose error the state would keep; not what interpolates, which makes the code values themselves; and not a head
 # whose base is apart: a residual of rare large values in 8 bits is what lost most, and such a head is a twentieth of the work.
 QUANTIZED = re.compile(r"network\.(stem|blocks\.\d+(\.conv)?|head\.features)\.weight")
+Made = tuple[Callable[[int, int, int], Iterator[Frame]], int, int]
 # Few clips have features as large as letters, one-pixel lines and stripes of any colours make them (noise two samples wide is
 # stripes, as the edges go on): cut off there, lines came out 36 codes wrong.
-Made = tuple[Callable[[int, int, int], Iterator[Frame]], int, int]
 MADE: tuple[Made, ...] = ((lines, 160, 96), (text, 160, 96), (noise, 160, 96), (noise, 160, 2), (noise, 2, 96))
 MADE_FRAMES = 16
 CALIBRATION_FRAMES = 8
 
 CODES, MIDDLE = "codes_about_zero", 128
 RESIDUAL = "residual"  # what the head makes of the features, in codes
-CELLS_BIAS = "network.head.cells.bias"  # what 8 bits take from that in the mean (Nagel et al. 2019, section 4.2)
+CELLS_BIAS = "network.head.cells.bias"  # what 8 bits take from the residual in the mean (Nagel et al. 2019, section 4.2)
 
-JOINING = ("Relu", "LeakyRelu", "Add")
+JOINING = ("Relu", "Add")
 
 
 def quantize(artifact: Path, path: Path, clips: Sequence[Path], *, name: str, frames: int = CALIBRATION_FRAMES) -> dict[str, Any]:
@@ -63,7 +63,7 @@ def quantize(artifact: Path, path: Path, clips: Sequence[Path], *, name: str, fr
     nodes = _quantized_nodes(model.graph)
     if not nodes:
         raise ModelError(f"{artifact} has no layer that is quantized: it is no GameSR network")
-    exact = [RESIDUAL, *(node.input[0] for node in model.graph.node if node.op_type == "LeakyRelu")]
+    left_float = [RESIDUAL, *(node.input[0] for node in model.graph.node if node.op_type == "LeakyRelu")]
     metadata = {entry.key: entry.value for entry in model.metadata_props}
     footage = _Footage(upscaler, clips, frames, MADE)
     even_channels(model, footage)
@@ -82,7 +82,7 @@ def quantize(artifact: Path, path: Path, clips: Sequence[Path], *, name: str, fr
                 extra_options={"TensorQuantOverrides": exact_codes(model.graph)},
             )
         quantized = onnx.load(whole)
-    for tensor in exact:
+    for tensor in left_float:
         leave_float(quantized.graph, tensor)
     if bias := next((tensor for tensor in quantized.graph.initializer if tensor.name == CELLS_BIAS), None):
         lost = mean_difference(model, quantized, RESIDUAL, _Footage(upscaler, clips, frames))
