@@ -12,18 +12,19 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from client.baselines import Baselines
 from client.compare import ComparisonWriter
 from client.detail import DetailUpscaler
 from client.errors import GamesrError, InputError, ModelError, OutputError
 from client.models import DEFAULT_MODEL, find_model
-from client.pipeline import upscale_stream
+from client.pipeline import Upscaler, upscale_stream
 from client.progress import Progress
 from client.reference import Reference
 from client.runtime import PROVIDERS
 from client.sink import FileSink
-from client.skipping import SkippingUpscaler
+from client.skipping import skipping_upscaler
 from client.summary import Summary
 from client.timing import Stamps
 from client.upscaler import OnnxUpscaler
@@ -71,7 +72,7 @@ def parser() -> argparse.ArgumentParser:
     part.add_argument(
         "--skip-unchanged",
         action="store_true",
-        help="compute only the tiles that changed; without a state exact, else some pixels differ a little from computing all",
+        help="compute only the tiles that changed (in OpenVINO: no frame twice); without a state exact, else some pixels differ a little",
     )
     part.add_argument(
         "--detail-share",
@@ -121,7 +122,7 @@ def upscale(arguments: argparse.Namespace) -> Summary:
         _check_distinct(output, arguments)
         sink = stack.enter_context(FileSink(output, source, force=arguments.force))
         size = source.width * scale, source.height * scale
-        skipping = SkippingUpscaler(upscaler) if arguments.skip_unchanged else None
+        skipping = skipping_upscaler(upscaler) if arguments.skip_unchanged else None
         detail = None
         if arguments.detail_share is not None:
             base = OnnxUpscaler(find_model("bicubic", scale), provider=arguments.provider, threads=arguments.threads)
@@ -138,10 +139,8 @@ def upscale(arguments: argparse.Namespace) -> Summary:
             # The yardstick is one, whatever runs ours: what a runtime's precision costs must not be taken from it as well.
             baselines = Baselines(names, scale, provider="cpu", threads=arguments.threads)
         (detail or upscaler).warm_up(source.height, source.width)
-        if skipping:
-            stream = upscale_stream(source, skipping, sink)
-        else:
-            stream = upscale_stream(source, detail, sink) if detail else upscale_stream(source, upscaler, sink)
+        chosen: Upscaler[Any] = skipping or detail or upscaler
+        stream = upscale_stream(source, chosen, sink)
 
         stamps: list[Stamps] = []
         damaged_frames = state_resets = 0

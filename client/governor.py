@@ -61,11 +61,15 @@ class Governor:
             return self._costs_ns[self.tier]
         return _median(self._upscale_ns) + _median([busy_ns for _, busy_ns in self._besides_ns])
 
-    def shown(self, now_ns: int, *, latency_ns: int, busy_ns: int, upscale_ns: int) -> Switch | None:
-        """A frame was presented `latency_ns` after its arrival; decoding, upscaling and presenting took `busy_ns`, of it `upscale_ns`."""
+    def shown(self, now_ns: int, *, latency_ns: int, busy_ns: int, upscale_ns: int, computed: bool = True) -> Switch | None:
+        """A frame was presented `latency_ns` after its arrival; decoding, upscaling and presenting took `busy_ns`, of it `upscale_ns`.
+
+        One that was not `computed`, since its picture was there, counts as a frame, but says nothing of how fast the tier is.
+        """
         self._latencies_ns.append(latency_ns)
-        self._upscale_ns.append(upscale_ns)
-        self._besides_ns.append((latency_ns - upscale_ns, busy_ns - upscale_ns))
+        if computed:
+            self._upscale_ns.append(upscale_ns)
+            self._besides_ns.append((latency_ns - upscale_ns, busy_ns - upscale_ns))
         if len(self._upscale_ns) == WINDOW_FRAMES:
             self._least_ns[self.tier] = min(self._least_ns[self.tier], _median(self._upscale_ns))
         return self._count(now_ns, missed=latency_ns > self.deadline_ns) or self._up(now_ns)

@@ -56,6 +56,7 @@ class PlaySummary:
                 "left_out": tally.left_out,
                 "unready": tally.unready,
                 "damaged": tally.damaged,
+                "repeated": tally.repeated,
             },
             "deadlines_kept": self._kept,
             "freezes": tally.freezes,
@@ -90,7 +91,8 @@ class PlaySummary:
         )
         lines = [
             f"{self.source}: {self.ended}",
-            f"  picture  {sizes}, x{spec.scale}; {tally.shown} frames shown in {self._seconds:.1f} s, {tally.damaged} damaged",
+            f"  picture  {sizes}, x{spec.scale}; {tally.shown} frames shown in {self._seconds:.1f} s, {tally.damaged} damaged"
+            f"{f', {tally.repeated} as the one before and not computed' if tally.repeated else ''}",
             f"  deadline {self.deadline_ns / 1e6:.1f} ms: {100 * self._kept:.2f}% kept; {tally.late} late, {tally.left_out} left out"
             f"{f', {tally.unready} came before all tiers were ready' if tally.unready else ''}",
             f"  freezes  {tally.freezes}, the longest gap {tally.longest_gap_ns / 1e6:.0f} ms",

@@ -16,13 +16,13 @@ from client.timing import LatencySummary, Stamps
 KEPT_FRAMES = 1 << 16  # 18 minutes at 60 fps
 FREEZE_PERIODS = 3
 _KEPT_SWITCHES = 100
-_FIRST, _LAST, _READY, _PACKET, _DECODED, _UPSCALED, _PRESENTED, _SENT, _TIER, _SIZE = range(10)
+_FIRST, _LAST, _READY, _PACKET, _DECODED, _UPSCALED, _PRESENTED, _SENT, _TIER, _SIZE, _COMPUTED = range(11)
 _STAGES = {
     "receive": (_FIRST, _LAST),  # the network's own
     "assemble": (_LAST, _READY),
     "queue": (_READY, _PACKET),
     "decode": (_PACKET, _DECODED),
-    "upscale": (_DECODED, _UPSCALED),
+    "upscale": (_COMPUTED, _UPSCALED),  # of what was: a picture shown again takes no model's time
     "present": (_UPSCALED, _PRESENTED),
     "total": (_LAST, _PRESENTED),
     "sent": (_SENT, _PRESENTED),
@@ -36,6 +36,7 @@ class PlayTally:
 
     `late` are shown frames that missed their deadline, `left_out` those that were not shown so that newer ones were in time,
     `unready` those that came while the tiers were made ready: the last tier showed them, if any did; nothing else counts them.
+    `repeated` are shown frames that were the one before once more, and so were not computed.
     A freeze is a gap of more than three periods between two pictures, whoever showed them, from the first shown frame on.
     """
 
@@ -44,6 +45,7 @@ class PlayTally:
     left_out: int = 0
     unready: int = 0
     damaged: int = 0
+    repeated: int = 0
     freezes: int = 0
     longest_gap_ns: int = 0
     restarts: Counter[str] = field(default_factory=Counter)  # by reason
@@ -54,7 +56,7 @@ class PlayTally:
     resized: int = 0
     first_ns: int = 0  # when the first was shown
     last_ns: int = 0  # when the last picture was, whoever showed it
-    _stamps: NDArray[np.int64] = field(default_factory=lambda: np.full((KEPT_FRAMES, 10), -1, np.int64), repr=False)  # touched: it is there
+    _stamps: NDArray[np.int64] = field(default_factory=lambda: np.full((KEPT_FRAMES, 11), -1, np.int64), repr=False)  # touched: it is there
     _tiers: list[str] = field(default_factory=list, repr=False)
 
     def add(self, item: Arrived, done: FrameDone, *, tier: str, deadline_ns: int, period_ns: int) -> None:
@@ -73,6 +75,7 @@ class PlayTally:
             -1 if item.sent_ns is None else item.sent_ns,
             self._tiers.index(tier),
             self.resized,
+            stamps.decoded_ns if done.computed_share else -1,
         )
         if not self.shown:
             self.first_ns = now_ns
@@ -80,6 +83,7 @@ class PlayTally:
         self.shown += 1
         self.late += now_ns - item.last_ns > deadline_ns
         self.damaged += done.decoded.damaged
+        self.repeated += not done.computed_share
         self.tier_frames[tier] += 1
         if done.restart is not None:
             self.restarts[done.restart.name.lower()] += 1
@@ -123,11 +127,11 @@ class PlayTally:
         return durations
 
     def most_shown(self) -> tuple[str, list[Stamps]]:
-        """The tier that showed most of the kept frames of the present size, and their stamps; raises ValueError where there are none."""
+        """The tier that made most of the kept pictures of the present size, and their stamps; raises ValueError where there are none."""
         rows = self._rows()
-        rows = rows[rows[:, _SIZE] == self.resized]
+        rows = rows[(rows[:, _SIZE] == self.resized) & (rows[:, _COMPUTED] != -1)]
         if not len(rows):
-            raise ValueError("no frame of the present size was shown")
+            raise ValueError("no picture of the present size was computed")
         tier = int(np.bincount(rows[:, _TIER]).argmax())
         passed = rows[rows[:, _TIER] == tier][:, [_PACKET, _DECODED, _UPSCALED, _PRESENTED]]
         return self._tiers[tier], [Stamps(*row) for row in passed.tolist()]

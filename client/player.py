@@ -176,6 +176,7 @@ class Player:
                 latency_ns=stamps.written_ns - item.last_ns,
                 busy_ns=stamps.written_ns - stamps.packet_ns,
                 upscale_ns=stamps.upscaled_ns - stamps.decoded_ns,
+                computed=done.computed_share > 0,
             )
         )
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from client.artifact import ModelSpec
 from client.frames import Frame
+from client.pipeline import Upscaler
+from client.repeats import RepeatUpscaler
 from client.tiles import Mask, TileGrid, Window
 from client.upscaler import OnnxUpscaler, State, copy_padded, plane_shapes
-from client.windows import run_windows, windowed_reach
+from client.windows import can_run_windows, run_windows, windowed_reach
 
 # Frames for which a recurrent network goes on with a tile that has stopped changing; docs/skipping.md says how it was measured.
 SETTLING_FRAMES = 8
@@ -112,6 +115,11 @@ class SkippingUpscaler:
             plane.setflags(write=False)  # the next picture may show the same arrays
         memory.picture = picture
         return picture, SkippingState(memory, restarted, share)
+
+
+def skipping_upscaler(upscaler: OnnxUpscaler) -> Upscaler[Any]:
+    """What leaves out as much as the runtime lets it: unchanged tiles, or, where it cannot run windows, frames that come again."""
+    return SkippingUpscaler(upscaler) if can_run_windows(upscaler) else RepeatUpscaler(upscaler)
 
 
 class _Memory:

@@ -14,6 +14,7 @@ from client.artifact import ModelSpec
 from client.errors import GamesrError, ModelError
 from client.frames import Frame
 from client.models import find_model
+from client.repeats import Shown
 from client.upscaler import OnnxUpscaler, State, plane_shapes
 
 TIMED_FRAMES = 5
@@ -23,18 +24,18 @@ _PAUSE_S = 0.001
 class TieredState:
     """What a `TieredUpscaler` hands from frame to frame; the memory itself is the upscaler's."""
 
-    __slots__ = ("height", "restarted", "stream", "width")
-    computed_share = 1.0
+    __slots__ = ("computed_share", "height", "restarted", "stream", "width")
 
-    def __init__(self, height: int, width: int, stream: int, restarted: bool) -> None:
+    def __init__(self, height: int, width: int, stream: int, restarted: bool = False, computed_share: float = 0.0) -> None:
         self.height, self.width = height, width
-        self.stream, self.restarted = stream, restarted
+        self.stream, self.restarted, self.computed_share = stream, restarted, computed_share
 
 
 class TieredUpscaler:
     """Models by name, the best first, each made ready for the size of the stream; set `tier` to choose. A context manager.
 
     With the step after that, the chosen model's memory begins anew: no memory is used by another network, nor one that missed frames.
+    A model without memory is not run for a frame equal to the one before, whose picture is shown again.
     All buffers are made by `prepare`, none by a switch. `display_height` chooses the scale, 2 or 3,
     that comes nearest to it; without, it is 2.
     It serves one stream at a time. Raises ModelError for what does not ship at the scale, and what `OnnxUpscaler` raises.
@@ -48,6 +49,7 @@ class TieredUpscaler:
         self._display_height, self._threads = display_height, threads
         self._loaded: dict[int, list[OnnxUpscaler]] = {}
         self._states: dict[int, State] = {}
+        self._shown: Shown | None = None  # by a model without memory
         self._running, self._stream = 0, 0
         self._preparation: _Preparation | None = None
         self.computing = threading.Lock()  # one model at a time: what plays must not slow down what is being timed
@@ -122,21 +124,25 @@ class TieredUpscaler:
             time.sleep(0.01)
         self._stream += 1
         self._begin_again()
-        return TieredState(height, width, self._stream, restarted=False)
+        return TieredState(height, width, self._stream)
 
     def step(self, frame: Frame, state: TieredState) -> tuple[Frame, TieredState]:
-        """Upscale one frame with the chosen tier; raises ValueError for a state that is not this stream's."""
+        """Upscale one frame with the chosen tier; the planes are not to be written to. Raises ValueError for a state of another stream."""
         if state.stream != self._stream:
             raise ValueError("this state is of a stream that was begun anew since")
         if self.tier != self._running:
             self._begin_again()
+        if self._shown is not None and (again := self._shown.again(frame)) is not None:
+            return again, TieredState(state.height, state.width, state.stream)
+        upscaler = self._upscalers[self._running]
         with self.computing:
-            picture, after = self._upscalers[self._running].step(frame, self._states[self._running])
+            picture, after = upscaler.step(frame, self._states[self._running])
         self._states[self._running] = after
-        return picture, TieredState(state.height, state.width, state.stream, after.restarted)
+        self._shown = None if upscaler.spec.state else Shown(frame, picture)
+        return picture, TieredState(state.height, state.width, state.stream, after.restarted, computed_share=1.0)
 
     def _begin_again(self) -> None:
-        self._running = self.tier
+        self._running, self._shown = self.tier, None
         self._states[self._running] = self._upscalers[self._running].begin_again(self._states[self._running])
 
     def _load(self, scale: int) -> list[OnnxUpscaler]:

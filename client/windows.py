@@ -12,6 +12,11 @@ from client.tiles import Box, Window
 from client.upscaler import OnnxUpscaler, State
 
 
+def can_run_windows(upscaler: OnnxUpscaler) -> bool:
+    """Whether the runtime takes windows of any size, and the state, where there is one, is in the processor's memory."""
+    return upscaler.provider not in OPENVINO and not (upscaler.provider == "cuda" and upscaler.spec.state)
+
+
 def windowed_reach(upscaler: OnnxUpscaler) -> int:
     """How far around a window the model looks; raises ModelError or ProviderError where it cannot be run in windows."""
     if upscaler.provider in OPENVINO:

@@ -20,8 +20,9 @@ from client.frames import Frame
 from client.models import DEFAULT_MODEL, find_model
 from client.pipeline import upscale_stream
 from client.quality import psnr_db, squared_error
+from client.runtime import PROVIDERS
 from client.sink import NullSink
-from client.skipping import SkippingUpscaler
+from client.skipping import skipping_upscaler
 from client.upscaler import OnnxUpscaler
 from server.encoding import EncodedStream, clip_frames
 
@@ -98,6 +99,11 @@ def pause(frames: list[Frame]) -> Iterator[Frame]:
     yield from chain(frames[:quarter], [frames[quarter]] * len(frames), frames[quarter : 2 * quarter])
 
 
+def still(frames: list[Frame]) -> Iterator[Frame]:
+    """One picture, twice as long as the clip."""
+    yield from [frames[0]] * (2 * len(frames))
+
+
 Scene = Callable[[list[Frame]], Iterator[Frame]]
 ROWS: tuple[tuple[Scene, str], ...] = (
     (motion, "CBR"),
@@ -110,6 +116,9 @@ ROWS: tuple[tuple[Scene, str], ...] = (
     (pause, "CRF 23"),
     (pause, "CBR"),
     (pause, "CBR, intra-refresh"),
+    (still, "CRF 23"),
+    (still, "CBR"),
+    (still, "CBR, intra-refresh"),
 )
 
 
@@ -157,7 +166,7 @@ def measure(clip: str, frames: list[Frame], scene: Scene, rate_control: str, kbp
     scale = upscaler.spec.scale
     settings = RateControl(kbps, FPS, over=RATE_CONTROLS[rate_control])
     with EncodedStream((area_downscale(frame, scale) for frame in scene(frames)), settings) as stream:
-        ways = upscale_stream(stream, upscaler, NullSink()), upscale_stream(stream, SkippingUpscaler(upscaler), NullSink())
+        ways = upscale_stream(stream, upscaler, NullSink()), upscale_stream(stream, skipping_upscaler(upscaler), NullSink())
         share, times_ns, errors, differing, greatest = 0.0, [0, 0], [0, 0], 0, 0
         for number, reference in enumerate(scene(frames)):
             done = {}
@@ -199,6 +208,7 @@ def parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("clips", metavar="CLIP", nargs="+", type=Path, help="a clip at full size, at least 8 frames")
     parser.add_argument("--model", metavar="NAME|FILE", default=DEFAULT_MODEL, help="a shipped x2 model or a file (default: %(default)s)")
+    parser.add_argument("--provider", choices=PROVIDERS, default="cpu", help="what runs the model (default: %(default)s)")
     parser.add_argument("--frames", metavar="N", type=_frame_count, default=60, help="frames of each clip to use (default: %(default)s)")
     parser.add_argument("--kbps", metavar="N", type=_kbps, default=6000, help="bitrate of CBR and intra-refresh (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print one JSON object a row instead of the table")
@@ -227,7 +237,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def report(arguments: argparse.Namespace) -> Iterator[Row]:
     """Every row of every clip, each as soon as it is measured; raises GamesrError."""
-    upscaler = OnnxUpscaler(find_model(arguments.model, 2), threads=1)  # more would spin while they wait, in processor time too
+    model = find_model(arguments.model, 2)
+    upscaler = OnnxUpscaler(model, provider=arguments.provider, threads=1)  # more would spin while they wait, in processor time too
     for path in arguments.clips:
         frames = list(clip_frames(path, 1, arguments.frames))
         multiple = 2 * upscaler.spec.scale

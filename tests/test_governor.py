@@ -169,6 +169,19 @@ def test_a_tier_that_always_fails_is_tried_ever_more_rarely() -> None:
     assert all(b >= min(1.9 * a, MAX_HOLD_NS) for a, b in itertools.pairwise(gaps))
 
 
+def test_pictures_shown_again_tempt_nobody_upwards() -> None:
+    """A menu for half a minute, of which a frame in ten is computed: what shows it is as fast as before, and what did not fit does not."""
+    governor = Governor([2 * PERIOD_NS, *COSTS_NS[1:]], deadline_ns=PERIOD_NS, period_ns=PERIOD_NS, now_ns=0)
+    tier, busy_ns = governor.tier, OTHER_NS + COSTS_NS[governor.tier]
+    for number in range(40 * SECOND):
+        again = 5 * SECOND < number < 35 * SECOND and number % 10 > 0
+        upscale_ns = MS // 10 if again else COSTS_NS[tier]
+        latency_ns = OTHER_NS + upscale_ns
+        switch = governor.shown(number * PERIOD_NS, latency_ns=latency_ns, busy_ns=latency_ns, upscale_ns=upscale_ns, computed=not again)
+        assert switch is None and (not number or governor.frame_ns == busy_ns)
+    assert tier > 0
+
+
 @settings(max_examples=25, deadline=None)
 @given(slow=st.floats(1.2, 8.0), lasts=st.integers(5, 20 * SECOND), seed=st.integers(0, 9))
 def test_it_climbs_back_when_the_load_goes(slow: float, lasts: int, seed: int) -> None:

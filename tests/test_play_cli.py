@@ -51,7 +51,7 @@ def test_a_file_into_y4m(play: Play, make_clip: MakeClip, model_file: Callable[.
     status, said, errors = play(clip, "--sink", out, "--json")
     record = json.loads(said)
     assert status == 0 and "Traceback" not in errors
-    assert record["frames"] == {"shown": FRAMES, "late": 0, "left_out": 0, "unready": 0, "damaged": 0}
+    assert record["frames"] == {"shown": FRAMES, "late": 0, "left_out": 0, "unready": 0, "damaged": 0, "repeated": 0}
     assert record["sizes"] == [[WIDTH, HEIGHT]] and record["reception"] is None and record["deadlines_kept"] == 1.0
     upscaler = OnnxUpscaler(model_file())
     state = upscaler.initial_state(HEIGHT, WIDTH)

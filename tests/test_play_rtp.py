@@ -96,7 +96,7 @@ def test_a_stream_is_shown_as_the_upscaler_makes_it(
         assert planes(shown) == planes(want)
     summary = player.summary("done", {})
     record = summary.record()
-    assert record["frames"] == {"shown": FRAMES, "late": 0, "left_out": 0, "unready": 0, "damaged": 0}
+    assert record["frames"] == {"shown": FRAMES, "late": 0, "left_out": 0, "unready": 0, "damaged": 0, "repeated": 0}
     latencies = player.tally.latencies(network=True)
     assert set(latencies) == {"receive", "assemble", "queue", "decode", "upscale", "present", "total", "sent"}
     stages = player.tally.durations_ns(network=True)

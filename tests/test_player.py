@@ -84,6 +84,20 @@ def test_every_frame_is_shown_as_the_upscaler_makes_it(tiers: TieredUpscaler) ->
     assert playing.tally.shown == 8 and playing.tally.missed == 0 and told.kinds() == ["begin"]
 
 
+def test_pictures_shown_again_are_counted_and_say_nothing_of_the_model(model_file: ModelFile) -> None:
+    """Each frame is shown at its time; upscaling was done, and is timed, once for each that is new."""
+    tiers = TieredUpscaler([str(model_file(stateful=False))], display_height=None, provider="cpu", threads=1)
+    tiers.prepare(32, 48)
+    sink = Kept()
+    playing, _ = player(Script([frame for frame in moving(5) for _ in range(4)]), tiers, sink)
+    playing.play()
+    tally = playing.tally
+    assert (tally.shown, len(sink.pictures), tally.repeated) == (20, 20, 15)
+    durations = tally.durations_ns(network=False)
+    assert len(durations["total"]) == 20 and len(durations["upscale"]) == 5
+    assert len(tally.most_shown()[1]) == 5
+
+
 def test_who_waits_is_left_out_and_all_are_counted(tiers: TieredUpscaler) -> None:
     """Only what cannot be in time, and only where newer ones wait."""
     late = Script(moving(20), waits={3: 1, 4: 2, 5: 1, 9: 1}, age_ns=50_000_000)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Callable
@@ -71,6 +72,28 @@ def test_a_tier_that_comes_back_remembers_nothing(tiers: TieredUpscaler) -> None
     for frame in frames[6:]:
         want, memory = alone.step(frame, memory)
     assert planes(shown) == planes(want)
+
+
+def test_a_picture_that_comes_again_is_not_computed_without_a_memory(tiers: TieredUpscaler, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With one it is, and so it is with another tier, and for a stream that begins anew."""
+    step, ran = OnnxUpscaler.step, []
+
+    def watched(self: OnnxUpscaler, frame: Frame, state: State) -> tuple[Frame, State]:
+        ran.append(self.spec.sha256)
+        return step(self, frame, state)
+
+    monkeypatch.setattr(OnnxUpscaler, "step", watched)
+    still, pictures, shares = picture(3, 32, 48), [], []
+    state = tiers.initial_state(32, 48)
+    for tier in (2, 2, 2, 0, 0, 2, 2):
+        tiers.tier = tier
+        shown, state = tiers.step(still, state)
+        pictures.append(planes(shown))
+        shares.append(state.computed_share)
+    assert shares == [1, 0, 0, 1, 1, 1, 0] and len(set(pictures[:3] + pictures[5:])) == 1
+    assert ran == [tiers.specs[tier].sha256 for tier in (2, 0, 0, 2)]
+    _, state = tiers.step(still, tiers.initial_state(32, 48))
+    assert state.computed_share == 1
 
 
 def test_a_state_of_before_is_refused(tiers: TieredUpscaler) -> None:
@@ -158,10 +181,10 @@ def test_what_plays_goes_on_while_others_are_timed(tiers: TieredUpscaler, steps:
     """Nearly every frame that is timed is followed by one that is shown."""
     while not tiers.ready(64, 96):
         time.sleep(0.001)
-    frame, state = picture(0, 64, 96), tiers.initial_state(64, 96)
+    frames, state = itertools.cycle(picture(t, 64, 96) for t in range(2)), tiers.initial_state(64, 96)
     steps.clear()
     while not tiers.complete:
-        _, state = tiers.step(frame, state)
+        _, state = tiers.step(next(frames), state)
         time.sleep(0.005)  # until the next one comes
     timed = steps.count("tiers")
     assert len(steps) - timed >= timed // 2 >= client.tiers.TIMED_FRAMES - 2
