@@ -15,6 +15,7 @@ from client.errors import ModelError, ProviderError
 
 FORMAT = "1"
 MAX_FILE_BYTES = 64 * 2**20
+MAX_WORD = 64  # characters of a name
 MAX_STATE_CHANNELS = 4096
 MAX_REACH = 2048
 ORT_PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
@@ -131,7 +132,7 @@ def _read_spec(metadata: dict[str, str], sha256: str) -> ModelSpec:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise _NotUnderstood(f"its metadata is incomplete or wrong ({error})") from error
-    if not all(text.isascii() and text.isprintable() and 0 < len(text) <= 64 for text in (spec.name, spec.precision)):
+    if not is_short_word(spec.name) or not is_short_word(spec.precision):
         raise _NotUnderstood("its name or its precision is not a short word")
     if spec.scale not in (2, 3):
         raise _NotUnderstood(f"its scale is {spec.scale}, not 2 or 3")
@@ -145,6 +146,11 @@ def _read_spec(metadata: dict[str, str], sha256: str) -> ModelSpec:
         if not _is_count(state.channels, MAX_STATE_CHANNELS) or not _is_count(state.divisor, 64) or spec.size_multiple % state.divisor:
             raise _NotUnderstood(f"its state {state.input} has {state.channels} channels at 1/{state.divisor} of the size")
     return spec
+
+
+def is_short_word(text: str) -> bool:
+    """Whether a text may be an artifact's name or precision: it is printed as it is."""
+    return text.isascii() and text.isprintable() and 0 < len(text) <= MAX_WORD
 
 
 def _is_count(value: object, limit: int) -> bool:

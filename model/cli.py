@@ -20,6 +20,7 @@ from client.models import WEIGHTS
 from client.runtime import PROVIDERS
 from client.upscaler import OnnxUpscaler
 from client.video import read_frames
+from model.artifact_files import new_artifacts
 from model.cards import card_page, training_card
 from model.catalogue import NAMES
 from model.evaluate import evaluate, table
@@ -124,23 +125,27 @@ def export_main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="gamesr-export",
         description="Write a trained network, or a baseline, as a self-describing ONNX artifact, its model card beside it.",
-        epilog="examples:\n  gamesr-export runs/mine_x2/checkpoint.pt mine\n  gamesr-export bicubic bicubic",
+        epilog="examples:\n  gamesr-export runs/mine_x2/checkpoint.pt mine\n  gamesr-export bicubic my-bicubic",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("weights", help=f"a run's checkpoint.pt; or {', '.join(BASELINES)}, for both scales")
     parser.add_argument("name", help="the model's name; its files are NAME_xSCALE.onnx and .md")
     parser.add_argument("--folder", type=Path, default=WEIGHTS, help="where to (default: %(default)s)")
+    parser.add_argument("--force", action="store_true", help="replace files that exist")
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     arguments = parser.parse_args(argv)
 
+    def paths_of(*scales: int) -> list[Path]:
+        return new_artifacts(arguments.name, scales, arguments.folder, source=Path(arguments.weights), force=arguments.force)
+
     def work() -> None:
         if arguments.weights in BASELINES:
-            for scale in (2, 3):
-                export_baseline(arguments.weights, scale, arguments.folder / f"{arguments.name}_x{scale}.onnx")
+            for scale, path in zip((2, 3), paths_of(2, 3), strict=True):
+                export_baseline(arguments.weights, scale, path)
             return
         checkpoint = load_checkpoint(Path(arguments.weights))
         network = network_of(checkpoint)
-        path = arguments.folder / f"{arguments.name}_x{network.scale}.onnx"
+        (path,) = paths_of(network.scale)
         card = export_network(network, path, name=arguments.name, card=training_card(checkpoint))
         path.with_suffix(".md").write_text(card_page(arguments.name, network.scale, card))
         print(path)

@@ -9,6 +9,7 @@ from pathlib import Path
 from client.errors import InputError
 from client.models import WEIGHTS
 from client.upscaler import OnnxUpscaler
+from model.artifact_files import new_artifacts
 from model.cards import card_page
 from model.cli import run_command
 from model.quantize import CALIBRATION_FRAMES, quantize
@@ -40,6 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("clips", type=Path, nargs="+", metavar="clip", help="low-resolution videos of several scenes")
     parser.add_argument("--frames", type=int, default=CALIBRATION_FRAMES, help="of each clip, from its start (default: %(default)s)")
     parser.add_argument("--folder", type=Path, default=WEIGHTS, help="where to (default: %(default)s)")
+    parser.add_argument("--force", action="store_true", help="replace files that exist")
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     arguments = parser.parse_args(argv)
 
@@ -47,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments.frames < 1:
             raise InputError("--frames must be 1 or more")
         scale = OnnxUpscaler(arguments.model, threads=1).spec.scale
-        path = arguments.folder / f"{arguments.name}_x{scale}.onnx"
+        (path,) = new_artifacts(arguments.name, [scale], arguments.folder, source=arguments.model, force=arguments.force)
         card = quantize(arguments.model, path, arguments.clips, name=arguments.name, frames=arguments.frames)
         path.with_suffix(".md").write_text(card_page(arguments.name, scale, card))
         print(path)

@@ -158,7 +158,7 @@ def test_evaluate_measures_each_row_once(workshop: Path, capsys: pytest.CaptureF
 
 def test_a_missing_folder_is_one_sentence(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert export_main([str(workshop / "run" / "checkpoint.pt"), "tiny", "--folder", str(workshop / "nowhere")]) == 1
-    assert capsys.readouterr().err.endswith("No such file or directory\n")
+    assert capsys.readouterr().err.endswith("nowhere is not a folder: make it, or name another with --folder\n")
 
 
 @pytest.mark.parametrize(

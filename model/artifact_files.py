@@ -1,0 +1,29 @@
+"""Where a new artifact goes, looked at before any work is done."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from client.artifact import MAX_WORD, is_short_word
+from client.errors import OutputError
+
+
+def new_artifacts(name: str, scales: Sequence[int], folder: Path, *, source: Path, force: bool) -> list[Path]:
+    """The artifact of model `name` at each scale; its page lies beside it as .md.
+
+    Raises OutputError for a name by which the client would not find it or read it, for a folder that is not there, for a file that is
+    there, unless `force` replaces it, and in any case where that is `source`, which the artifact is made of.
+    """
+    if not is_short_word(name) or any(separator in name for separator in "/\\") or name.endswith(".onnx"):
+        rule = f"use up to {MAX_WORD} printable ASCII characters, no / or \\ and no .onnx"
+        raise OutputError(f"{name!r} cannot be a model's name: {rule}")
+    if not folder.is_dir():
+        raise OutputError(f"{folder} is not a folder: make it, or name another with --folder")
+    paths = [folder / f"{name}_x{scale}.onnx" for scale in scales]
+    for file in (file for path in paths for file in (path, path.with_suffix(".md")) if file.exists()):
+        if source.exists() and file.samefile(source):
+            raise OutputError(f"cannot write {file}: it is the input, so choose another name")
+        if not force:
+            raise OutputError(f"{file} exists: choose another name, or replace it with --force")
+    return paths

@@ -1,0 +1,108 @@
+"""What gamesr-export and gamesr-quantize refuse to write, before they do any work."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from client import models
+from client.errors import OutputError
+from client.upscaler import OnnxUpscaler
+from model.artifact_files import new_artifacts
+from model.cli import export_main
+from model.quantize_cli import main as quantize_main
+
+ModelFile = Callable[..., Path]
+
+
+@pytest.mark.parametrize("name", ["mine", "mine 2.1-b", "x" * 64])
+def test_a_model_of_a_name_that_is_taken_is_found_and_read(
+    name: str, model_file: ModelFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(models, "WEIGHTS", tmp_path)
+    for scale, path in zip((2, 3), new_artifacts(name, (2, 3), tmp_path, source=Path("bicubic"), force=False), strict=True):
+        model_file(path.name, metadata={"name": name}, scale=scale)
+        found = models.find_model(name, scale)
+        spec = OnnxUpscaler(found, threads=1).spec
+        assert found == path and (spec.name, spec.scale) == (name, scale)
+
+
+@pytest.mark.parametrize("name", ["", "x" * 65, "über", "two\nlines", "no/where", "folder/", "/", "no\\where", "mine.onnx"])
+def test_any_other_name_is_refused(name: str, tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OutputError, match="cannot be a model's name") as error:
+        new_artifacts(name, [2], tmp_path, source=Path("bicubic"), force=True)
+    assert "\n" not in str(error.value)
+
+
+@pytest.fixture
+def idle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever work a command does fails the test."""
+
+    def work(*_: object, **__: object) -> None:
+        pytest.fail("the work has begun")
+
+    monkeypatch.setattr("model.cli.export_baseline", work)
+    monkeypatch.setattr("model.quantize_cli.quantize", work)
+
+
+@pytest.fixture(params=["export", "quantize"])
+def command(request: pytest.FixtureRequest, idle: None, model_file: ModelFile, tmp_path: Path) -> Callable[..., int]:
+    """A command that is given a name and options, and writes into the folder `out`."""
+    (tmp_path / "out").mkdir()
+    into = ["--folder", str(tmp_path / "out")]
+    if request.param == "export":
+        return lambda name, *options: export_main(["lanczos", name, *into, *options])
+    model = str(model_file(scale=3))
+    return lambda name, *options: quantize_main([model, name, "clip.mkv", *into, *options])
+
+
+@pytest.mark.parametrize("there", ["mine_x3.onnx", "mine_x3.md"])
+def test_a_file_that_is_there_is_left_before_any_work(
+    there: str, command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "out" / there
+    file.write_text("somebody's")
+    assert command("mine") == 1
+    assert capsys.readouterr().err.endswith(f": {file} exists: choose another name, or replace it with --force\n")
+    assert file.read_text() == "somebody's" and list(file.parent.iterdir()) == [file]
+    for name, option in (("mine", "--force"), ("another", "--debug")):
+        with pytest.raises(pytest.fail.Exception, match="the work has begun"):
+            command(name, option)
+
+
+def test_names_and_folders_are_looked_at_before_any_work(
+    command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    for arguments, sentence in (
+        (["über"], "'über' cannot be a model's name"),
+        (["mine", "--folder", str(tmp_path / "nowhere")], "nowhere is not a folder"),
+        (["mine", "--folder", str(tmp_path / "file")], "file is not a folder"),
+    ):
+        assert command(*arguments, "--force") == 1
+        said = capsys.readouterr().err
+        assert sentence in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize("link", [False, True])
+def test_a_model_is_never_written_over_itself(
+    link: bool, idle: None, model_file: ModelFile, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = model_file("mine_x2.onnx")
+    before = model.read_bytes()
+    folder = tmp_path / "linked"
+    if link:
+        folder.symlink_to(tmp_path)
+    for options in ([], ["--force"]):
+        assert quantize_main([str(model), "mine", "clip.mkv", "--folder", str(folder if link else tmp_path), *options]) == 1
+        assert capsys.readouterr().err.endswith("mine_x2.onnx: it is the input, so choose another name\n")
+    assert model.read_bytes() == before
+
+
+def test_what_ships_is_not_replaced_by_a_command_that_does_not_say_so(idle: None, capsys: pytest.CaptureFixture[str]) -> None:
+    assert export_main(["bicubic", "bicubic"]) == 1
+    assert quantize_main([str(models.find_model("live", 2)), "live-int8", "clip.mkv"]) == 1
+    assert capsys.readouterr().err.count("exists: choose another name, or replace it with --force\n") == 2
