@@ -1,12 +1,18 @@
-"""Where a new artifact goes, looked at before any work is done."""
+"""Where a new artifact and its page go, looked at before any work is done; and how they get there, whole or not at all."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
+
+import onnx
 
 from client.artifact import MAX_WORD, is_short_word
 from client.errors import OutputError
+
+Page = Callable[[str, int, dict[str, Any]], str]  # of a name, a scale and a card: Markdown
 
 
 def new_artifacts(name: str, scales: Sequence[int], folder: Path, *, source: Path, force: bool) -> list[Path]:
@@ -27,3 +33,20 @@ def new_artifacts(name: str, scales: Sequence[int], folder: Path, *, source: Pat
         if not force:
             raise OutputError(f"{file} exists: choose another name, or replace it with --force")
     return paths
+
+
+def write_artifact(model: onnx.ModelProto, path: Path, page: str | None) -> None:
+    """Write an artifact and its page, of which nothing is seen before both are whole; without a page none stays beside it."""
+    beside = path.with_suffix(".md")
+    partial, partial_page = (file.with_name(f"{file.name}.{os.getpid()}.partial") for file in (path, beside))
+    try:
+        onnx.save(model, str(partial))
+        if page is None:
+            beside.unlink(missing_ok=True)
+        else:
+            partial_page.write_text(page)
+            partial_page.replace(beside)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+        partial_page.unlink(missing_ok=True)

@@ -6,6 +6,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from client.errors import ModelError
 from model.train import TrainConfig
 
 Card = dict[str, Any]
@@ -45,7 +46,16 @@ def training_command(config: TrainConfig) -> str:
 
 
 def card_page(name: str, scale: int, card: Card) -> str:
-    """The card as Markdown."""
+    """The card as Markdown; raises ModelError when something is missing in it."""
+    try:
+        return "\n".join(_lines(name, scale, card)) + "\n"
+    except KeyError as missing:
+        raise ModelError(
+            f"the model's card does not say {missing}, which its page needs: export the model again from its checkpoint"
+        ) from None
+
+
+def _lines(name: str, scale: int, card: Card) -> list[str]:
     precision, made_from = "float32", []
     if "quantized_from" in card:
         precision = "int8"
@@ -80,4 +90,4 @@ def card_page(name: str, scale: int, card: Card) -> str:
         "An input `area` is the reference downscaled by area, `area@4000` the same through x264 at 4000 kbps (zerolatency).",
         "OpenArena's data is GPL-2+; SuperTuxKart's is under CC-BY-SA, CC-BY, CC0 and GPL.",
     ]
-    return "\n".join(lines) + "\n"
+    return lines

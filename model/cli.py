@@ -146,8 +146,7 @@ def export_main(argv: Sequence[str] | None = None) -> int:
         checkpoint = load_checkpoint(Path(arguments.weights))
         network = network_of(checkpoint)
         (path,) = paths_of(network.scale)
-        card = export_network(network, path, name=arguments.name, card=training_card(checkpoint))
-        path.with_suffix(".md").write_text(card_page(arguments.name, network.scale, card))
+        export_network(network, path, name=arguments.name, card=training_card(checkpoint), page=card_page)
         print(path)
 
     return run_command(parser, arguments, work, "stopped")

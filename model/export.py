@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import json
 import logging
-import os
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from model.artifact_files import Page, write_artifact
 from model.complexity import macs, parameter_count
 from model.fsr1 import SHARPNESS_STOPS, Fsr1
 from model.interpolation import MIDDLES, Interpolation, chroma_shift
@@ -90,8 +90,8 @@ class Frontend(nn.Module):
         return (*planes, *after, after.h.mean() + after.c.mean())
 
 
-def export_network(network: Network, path: Path, *, name: str, card: dict[str, Any]) -> dict[str, Any]:
-    """Fuse and write a network; `card` says where its weights come from and is returned whole, shape and counts added.
+def export_network(network: Network, path: Path, *, name: str, card: dict[str, Any], page: Page | None = None) -> None:
+    """Fuse and write a network; `card` says where its weights come from, shape and counts are added; `page` makes what lies beside it.
 
     The counts are of the form that runs: its parameters, and `macs_540p`, the multiply-accumulates of a 960x540 frame.
     `network` itself is left as it is.
@@ -116,8 +116,8 @@ def export_network(network: Network, path: Path, *, name: str, card: dict[str, A
         "reach": network_reach(copy.deepcopy(fused).double()),
         "card": card,
     }
-    _write(Frontend(fused), path, state, divisor, metadata)
-    return card
+    model = _traced(Frontend(fused), state, divisor, metadata)
+    write_artifact(model, path, page and page(name, network.scale, card))
 
 
 def export_baseline(name: str, scale: int, path: Path) -> None:
@@ -134,7 +134,7 @@ def export_baseline(name: str, scale: int, path: Path) -> None:
         card = {"interpolation": name}
     far = reach(module.double().samples, 2)
     metadata = {"name": name, "scale": scale, "size_multiple": 2, "precision": "float32", "state": [], "reach": far, "card": card}
-    _write(module.float(), path, None, 1, metadata)
+    write_artifact(_traced(module.float(), None, 1, metadata), path, None)
 
 
 def state_entry(part: str, channels: int, divisor: int) -> dict[str, object]:
@@ -169,7 +169,7 @@ def _name_slopes(module: nn.Module, graph: onnx.GraphProto) -> None:
         graph.initializer.remove(tensor)
 
 
-def _write(module: nn.Module, path: Path, state: State | None, divisor: int, metadata: dict[str, Any]) -> None:
+def _traced(module: nn.Module, state: State | None, divisor: int, metadata: dict[str, Any]) -> onnx.ModelProto:
     chroma = torch.zeros(1, 1, TRACED[0] // 2, TRACED[1] // 2, dtype=torch.uint8)
     luma = torch.zeros(1, 1, *TRACED, dtype=torch.uint8)
     rows, columns = torch.export.Dim("rows", min=1), torch.export.Dim("columns", min=1)
@@ -203,6 +203,4 @@ def _write(module: nn.Module, path: Path, state: State | None, divisor: int, met
         text = value if isinstance(value, str) else json.dumps(value)
         model.metadata_props.append(onnx.StringStringEntryProto(key=key, value=text))
     onnx.checker.check_model(model, full_check=True)
-    partial = path.with_suffix(f".{os.getpid()}.partial")
-    onnx.save(model, str(partial))
-    partial.replace(path)
+    return model

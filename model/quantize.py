@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import json
 import logging
-import os
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -24,6 +23,7 @@ from client.errors import InputError, ModelError
 from client.frames import Frame
 from client.upscaler import OnnxUpscaler, copy_padded, plane_shapes
 from client.video import read_frames
+from model.artifact_files import Page, write_artifact
 from model.calibration import Feeds, even_channels, mean_difference
 from model.hard_cases import lines, noise, text
 from model.lean import ARCHITECTURE, CELL
@@ -45,8 +45,10 @@ CELLS_BIAS = "network.head.cells.bias"  # what 8 bits take from the residual in 
 JOINING = ("Relu", "Add")
 
 
-def quantize(artifact: Path, path: Path, clips: Sequence[Path], *, name: str, frames: int = CALIBRATION_FRAMES) -> dict[str, Any]:
-    """Write an int8 artifact; its card, which is returned, says what it was made from and calibrated on.
+def quantize(
+    artifact: Path, path: Path, clips: Sequence[Path], *, name: str, frames: int = CALIBRATION_FRAMES, page: Page | None = None
+) -> None:
+    """Write an int8 artifact, whose card says what it was made from and calibrated on; `page` makes what lies beside it.
 
     `clips` are videos of the artifact's input, low resolution and compressed as they will be; the ranges of the features are
     the smallest and the largest value in the first `frames` frames of each, the state carried by the float network, and in
@@ -90,10 +92,7 @@ def quantize(artifact: Path, path: Path, clips: Sequence[Path], *, name: str, fr
     card = {**upscaler.spec.card, "quantized_from": upscaler.spec.sha256, "calibration": footage.played}
     helper.set_model_props(quantized, {**metadata, "name": name, "precision": "int8", "card": json.dumps(card)})
     onnx.checker.check_model(quantized, full_check=True)
-    partial = path.with_suffix(f".{os.getpid()}.partial")
-    onnx.save(quantized, str(partial))
-    partial.replace(path)
-    return card
+    write_artifact(quantized, path, page and page(name, upscaler.spec.scale, card))
 
 
 class _Footage(CalibrationDataReader):  # type: ignore[misc]

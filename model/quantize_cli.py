@@ -50,8 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise InputError("--frames must be 1 or more")
         scale = OnnxUpscaler(arguments.model, threads=1).spec.scale
         (path,) = new_artifacts(arguments.name, [scale], arguments.folder, source=arguments.model, force=arguments.force)
-        card = quantize(arguments.model, path, arguments.clips, name=arguments.name, frames=arguments.frames)
-        path.with_suffix(".md").write_text(card_page(arguments.name, scale, card))
+        quantize(arguments.model, path, arguments.clips, name=arguments.name, frames=arguments.frames, page=card_page)
         print(path)
 
     return run_command(parser, arguments, work, "stopped")

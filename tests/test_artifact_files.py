@@ -1,18 +1,20 @@
-"""What gamesr-export and gamesr-quantize refuse to write, before they do any work."""
+"""What gamesr-export and gamesr-quantize refuse to write, before they do any work; and that what they write is whole."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
 
+import onnx
 import pytest
 
 from client import models
 from client.errors import OutputError
 from client.upscaler import OnnxUpscaler
-from model.artifact_files import new_artifacts
+from model.artifact_files import new_artifacts, write_artifact
 from model.cli import export_main
 from model.quantize_cli import main as quantize_main
+from tests.conftest import tiny_model
 
 ModelFile = Callable[..., Path]
 
@@ -106,3 +108,41 @@ def test_what_ships_is_not_replaced_by_a_command_that_does_not_say_so(idle: None
     assert export_main(["bicubic", "bicubic"]) == 1
     assert quantize_main([str(models.find_model("live", 2)), "live-int8", "clip.mkv"]) == 1
     assert capsys.readouterr().err.count("exists: choose another name, or replace it with --force\n") == 2
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_an_artifact_takes_the_place_of_another_page_and_all(tmp_path: Path) -> None:
+    for model, page in ((tiny_model(gain=0.5), "one"), (tiny_model(gain=0.9), "another")):
+        write_artifact(model, tmp_path / "mine_x2.onnx", page)
+        assert files(tmp_path) == {"mine_x2.onnx": model.SerializeToString(), "mine_x2.md": page.encode()}
+    write_artifact(model, tmp_path / "mine_x2.onnx", None)
+    assert files(tmp_path) == {"mine_x2.onnx": model.SerializeToString()}
+
+
+@pytest.mark.parametrize("stopped_by", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=["full", "interrupted"])
+@pytest.mark.parametrize("half", ["artifact", "page"])
+def test_what_cannot_be_written_leaves_everything_as_it_was(
+    half: str, stopped_by: BaseException, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_artifact(tiny_model(), tmp_path / "mine_x2.onnx", "mine")
+    before = files(tmp_path)
+
+    def save(model: onnx.ModelProto, path: str) -> None:
+        Path(path).write_bytes(model.SerializeToString()[:100])
+        raise stopped_by
+
+    def write_text(path: Path, text: str) -> None:
+        path.write_bytes(text.encode()[:2])
+        raise stopped_by
+
+    if half == "artifact":
+        monkeypatch.setattr(onnx, "save", save)
+    else:
+        monkeypatch.setattr(Path, "write_text", write_text)
+    for name in ("mine", "new"):
+        with pytest.raises(type(stopped_by)):
+            write_artifact(tiny_model(gain=0.9), tmp_path / f"{name}_x2.onnx", "another")
+    assert files(tmp_path) == before

@@ -221,6 +221,14 @@ def test_what_cannot_be_quantized_is_refused(folder: Path, tmp_path: Path) -> No
     assert not (tmp_path / "out.onnx").exists() and not list(tmp_path.glob("*.partial"))
 
 
+def test_a_card_that_has_no_page_is_one_sentence_and_no_file(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What `folder` has was exported without any history."""
+    assert main([str(folder / "recurrent.onnx"), "new", str(folder / "clip.mkv"), "--frames", "1", "--folder", str(tmp_path)]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("gamesr-quantize: the model's card does not say 'before', which its page needs: ") and said.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
 def test_from_a_checkpoint_to_a_verified_int8_artifact(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     footage = write_footage(tmp_path)
     tiny = ["--steps", "2", "--batch", "1", "--patch", "16", "--frames", "2", "--window", "2", "--degradations", "area"]
