@@ -124,12 +124,12 @@ def train_main(argv: Sequence[str] | None = None) -> int:
 def export_main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="gamesr-export",
-        description="Write a trained network, or a baseline, as a self-describing ONNX artifact, its model card beside it.",
+        description="Write a trained network, with its model card beside it, or a baseline, as a self-describing ONNX artifact.",
         epilog="examples:\n  gamesr-export runs/mine_x2/checkpoint.pt mine\n  gamesr-export bicubic my-bicubic",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("weights", help=f"a run's checkpoint.pt; or {', '.join(BASELINES)}, for both scales")
-    parser.add_argument("name", help="the model's name; its files are NAME_xSCALE.onnx and .md")
+    parser.add_argument("name", help="the model's name; its files are NAME_xSCALE.onnx and, of a trained network, .md")
     parser.add_argument("--folder", type=Path, default=WEIGHTS, help="where to (default: %(default)s)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
@@ -141,7 +141,8 @@ def export_main(argv: Sequence[str] | None = None) -> int:
     def work() -> None:
         if arguments.weights in BASELINES:
             for scale, path in zip((2, 3), paths_of(2, 3), strict=True):
-                export_baseline(arguments.weights, scale, path)
+                export_baseline(arguments.weights, scale, path, name=arguments.name)
+                print(path)
             return
         checkpoint = load_checkpoint(Path(arguments.weights))
         network = network_of(checkpoint)

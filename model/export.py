@@ -120,18 +120,18 @@ def export_network(network: Network, path: Path, *, name: str, card: dict[str, A
     write_artifact(model, path, page and page(name, network.scale, card))
 
 
-def export_baseline(name: str, scale: int, path: Path) -> None:
-    """Write one of BASELINES; its card says what it computes."""
+def export_baseline(kind: str, scale: int, path: Path, *, name: str) -> None:
+    """Write `kind`, one of BASELINES, under a name; its card says what it computes, and there is no page beside it."""
     module: Baseline | Fsr1Baseline
-    if name in FSR1_PASSES:
-        module = Fsr1Baseline(scale, sharpen=name == "fsr1")
+    if kind in FSR1_PASSES:
+        module = Fsr1Baseline(scale, sharpen=kind == "fsr1")
         card = {
-            "algorithm": f"AMD FidelityFX Super Resolution 1.0: {FSR1_PASSES[name]}, on BT.709 limited-range RGB",
+            "algorithm": f"AMD FidelityFX Super Resolution 1.0: {FSR1_PASSES[kind]}, on BT.709 limited-range RGB",
             "note": "made for the shaders of a GPU: its time on a CPU is not its time on a GPU",
         }
     else:
-        module = Baseline(name, scale)
-        card = {"interpolation": name}
+        module = Baseline(kind, scale)
+        card = {"interpolation": kind}
     far = reach(module.double().samples, 2)
     metadata = {"name": name, "scale": scale, "size_multiple": 2, "precision": "float32", "state": [], "reach": far, "card": card}
     write_artifact(_traced(module.float(), None, 1, metadata), path, None)

@@ -91,7 +91,7 @@ def test_any_size_goes_through_one_artifact(artifacts: dict[str, Path], size: tu
 
 @pytest.mark.parametrize("scale", [2, 3])
 def test_bicubic_is_torchs_bicubic_and_chroma_stays_where_it_is(tmp_path: Path, scale: int) -> None:
-    export_baseline("bicubic", scale, tmp_path / "bicubic.onnx")
+    export_baseline("bicubic", scale, tmp_path / "bicubic.onnx", name="bicubic")
     upscaler = OnnxUpscaler(tmp_path / "bicubic.onnx", threads=1)
     frame = frames(20, 28, 1)[0]
     picture, _ = upscaler.step(frame, upscaler.initial_state(20, 28))
@@ -110,6 +110,6 @@ def test_bicubic_is_torchs_bicubic_and_chroma_stays_where_it_is(tmp_path: Path, 
 
 
 def test_a_baseline_has_nothing_to_verify(tmp_path: Path) -> None:
-    export_baseline("lanczos", 2, tmp_path / "lanczos.onnx")
+    export_baseline("lanczos", 2, tmp_path / "lanczos.onnx", name="lanczos")
     with pytest.raises(ModelError, match="is no network"):
         network_of_artifact(tmp_path / "lanczos.onnx")

@@ -132,7 +132,7 @@ def test_the_shipped_artifact_is_its_float64_reference_at_any_size(name: str, sc
 
 
 def test_what_is_exported_says_what_it_is(tmp_path: Path) -> None:
-    export_baseline("easu", 2, tmp_path / "exported.onnx")
+    export_baseline("easu", 2, tmp_path / "exported.onnx", name="easu")
     exported, shipped = (OnnxUpscaler(path, threads=1).spec for path in (tmp_path / "exported.onnx", find_model("easu", 2)))
     assert replace(exported, sha256=shipped.sha256) == shipped
     assert (shipped.name, shipped.scale, shipped.state) == ("easu", 2, ())

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import onnx
 import pytest
 
 from client.models import find_model
@@ -50,6 +49,17 @@ def test_a_card_names_the_runs_that_a_run_was_built_on(workshop: Path) -> None:
     assert "- Built on: `gamesr-train FOOTAGE.toml RUN --degradations area --steps 4 " in page
     assert "--initial-weights run/checkpoint.pt`" in page
     assert str(workshop) not in page
+
+
+def test_a_baseline_has_the_name_that_it_is_given_and_no_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for path in (pages := [tmp_path / f"plain_x{scale}.md" for scale in (2, 3)]):
+        path.write_text("of a network that was here before")
+    assert export_main(["lanczos", "plain", "--folder", str(tmp_path), "--force"]) == 0
+    assert capsys.readouterr().out.splitlines() == [str(path.with_suffix(".onnx")) for path in pages]
+    assert {path.name for path in tmp_path.iterdir()} == {"plain_x2.onnx", "plain_x3.onnx"}
+    for path in pages:
+        spec = OnnxUpscaler(path.with_suffix(".onnx"), threads=1).spec
+        assert (f"{spec.name}_x{spec.scale}", spec.card) == (path.stem, {"interpolation": "lanczos"})
 
 
 def test_verify_holds_the_artifact_against_float64(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -105,9 +115,6 @@ def test_verify_enforces_every_bound(
 def test_evaluate_refuses_two_models_of_one_name(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert export_main(["lanczos", "bicubic", "--folder", str(workshop)]) == 0
     other = workshop / "bicubic_x2.onnx"
-    proto = onnx.load(other)
-    next(p for p in proto.metadata_props if p.key == "name").value = "bicubic"
-    onnx.save(proto, other)
     command = [str(workshop / "footage.toml"), "--cache", str(workshop / "cache"), "--rows", str(workshop / "names.jsonl"), "--scales", "2"]
     assert evaluate_main([*command, "--frames", "1", "--degradations", "area", "--models", "bicubic", str(other)]) == 1
     said = capsys.readouterr().err

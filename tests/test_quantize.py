@@ -79,7 +79,7 @@ def played(model: Path, frames: list[Frame], provider: str) -> Iterator[Frame]:
 def test_int8_comes_near_the_float32_artifact(folder: Path, name: str, provider: str) -> None:
     frames = [picture(t, 96, 144) for t in range(20)]
     bicubic = folder / "bicubic.onnx"
-    export_baseline("bicubic", 2, bicubic)
+    export_baseline("bicubic", 2, bicubic, name="bicubic")
     for plane in "yuv":
         rounded, exact, nothing = (
             np.stack([getattr(p, plane) for p in played(model, frames, by)]).astype(float)
@@ -209,7 +209,7 @@ def test_any_size_and_a_lost_state_go_through_it(folder: Path) -> None:
 
 
 def test_what_cannot_be_quantized_is_refused(folder: Path, tmp_path: Path) -> None:
-    export_baseline("bicubic", 2, tmp_path / "bicubic.onnx")
+    export_baseline("bicubic", 2, tmp_path / "bicubic.onnx", name="bicubic")
     (tmp_path / "broken.h264").write_bytes(bytes(range(256)) * 40)
     for model, clip, error, sentence in (
         (tmp_path / "bicubic.onnx", folder / "clip.mkv", ModelError, "no layer that is quantized"),

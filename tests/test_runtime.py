@@ -26,7 +26,7 @@ def artifacts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     paths = {name: folder / f"{name}.onnx" for name in ("planes", "balanced", "live", "bicubic")}
     for preset in ("planes", "balanced", "live"):
         export_network(random_network(preset, 2), paths[preset], name=preset, card={})
-    export_baseline("bicubic", 2, paths["bicubic"])
+    export_baseline("bicubic", 2, paths["bicubic"], name="bicubic")
     return paths
 
 
