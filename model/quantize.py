@@ -18,10 +18,10 @@ import onnx
 from onnx import helper, numpy_helper
 from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
 
-from client.artifact import ModelSpec
+from client.artifact import ModelSpec, load_session
 from client.errors import InputError, ModelError
 from client.frames import Frame
-from client.upscaler import OnnxUpscaler, copy_padded, plane_shapes
+from client.upscaler import copy_padded, plane_shapes
 from client.video import read_frames
 from model.artifact_files import Page, write_artifact
 from model.calibration import Feeds, even_channels, mean_difference
@@ -51,23 +51,23 @@ def quantize(
     """Write an int8 artifact, whose card says what it was made from and calibrated on; `page` makes what lies beside it.
 
     `clips` are videos of the artifact's input, low resolution and compressed as they will be; the ranges of the features are
-    the smallest and the largest value in the first `frames` frames of each, the state carried by the float network, and in
-    `MADE_FRAMES` frames of each of `MADE`. Weights are symmetric, a scale for each output channel, features unsigned with one scale
-    and zero point for a tensor (signed ones take twice as long in both runtimes), of which every channel is made to use all
-    (`even_channels`). What 8 bits do to the mean of the clips' pictures is taken back where the layers carry the cells. Raises
-    ModelError for an artifact that is not a float32 network of ours and InputError for a clip without frames.
+    the smallest and the largest value in the first `frames` frames of each, and in `MADE_FRAMES` frames of each of `MADE`. Weights
+    are symmetric, a scale for each output channel, features unsigned with one scale and zero point for a tensor (signed ones take
+    twice as long in both runtimes), of which every channel is made to use all (`even_channels`). What 8 bits do to the mean of the
+    clips' pictures is taken back where the layers carry the cells. Raises ModelError for an artifact that is not a float32 network of
+    ours and InputError for a clip without frames.
     """
-    upscaler = OnnxUpscaler(artifact)
+    _, spec = load_session(artifact, "cpu", 1)
     model = onnx.load(artifact)
-    if upscaler.spec.precision != "float32":
-        raise ModelError(f"{artifact} is {upscaler.spec.precision} already: quantize the float32 artifact")
-    split_carried_cells(model.graph, upscaler.spec)
+    if spec.precision != "float32":
+        raise ModelError(f"{artifact} is {spec.precision} already: quantize the float32 artifact")
+    split_carried_cells(model.graph, spec)
     nodes = _quantized_nodes(model.graph)
     if not nodes:
         raise ModelError(f"{artifact} has no layer that is quantized: it is no GameSR network")
     left_float = [RESIDUAL, *(node.input[0] for node in model.graph.node if node.op_type == "LeakyRelu")]
     metadata = {entry.key: entry.value for entry in model.metadata_props}
-    footage = _Footage(upscaler, clips, frames, MADE)
+    footage = _Footage(spec, clips, frames, MADE)
     even_channels(model, footage)
     with tempfile.TemporaryDirectory(prefix="gamesr-quantize-") as folder:
         whole = Path(folder) / "int8.onnx"
@@ -87,23 +87,24 @@ def quantize(
     for tensor in left_float:
         leave_float(quantized.graph, tensor)
     if bias := next((tensor for tensor in quantized.graph.initializer if tensor.name == CELLS_BIAS), None):
-        lost = mean_difference(model, quantized, RESIDUAL, _Footage(upscaler, clips, frames))
+        lost = mean_difference(model, quantized, RESIDUAL, _Footage(spec, clips, frames))
         bias.CopyFrom(numpy_helper.from_array(lost.astype(np.float32), CELLS_BIAS))
-    card = {**upscaler.spec.card, "quantized_from": upscaler.spec.sha256, "calibration": footage.played}
+    card = {**spec.card, "quantized_from": spec.sha256, "calibration": footage.played}
     helper.set_model_props(quantized, {**metadata, "name": name, "precision": "int8", "card": json.dumps(card)})
     onnx.checker.check_model(quantized, full_check=True)
-    write_artifact(quantized, path, page and page(name, upscaler.spec.scale, card))
+    write_artifact(quantized, path, page and page(name, spec.scale, card))
 
 
 class _Footage(CalibrationDataReader):  # type: ignore[misc]
-    """The inputs of the graph, frame by frame: planes, and the state that the float network has come to; anew whenever gone through.
+    """The inputs of the graph, frame by frame; anew whenever gone through.
 
+    The state is zeros with every frame: what comes in 8 bits lies before the gates and does not depend on it.
     `played` says which clips are through, and how many of their frames that were.
     """
 
-    def __init__(self, upscaler: OnnxUpscaler, clips: Sequence[Path], most: int, made: Sequence[Made] = ()) -> None:
+    def __init__(self, spec: ModelSpec, clips: Sequence[Path], most: int, made: Sequence[Made] = ()) -> None:
         self.played: list[str] = []
-        self._upscaler, self._clips, self._most, self._made = upscaler, clips, most, made
+        self._spec, self._clips, self._most, self._made = spec, clips, most, made
         self._inputs = iter(self)
 
     def get_next(self) -> Feeds | None:
@@ -111,32 +112,28 @@ class _Footage(CalibrationDataReader):  # type: ignore[misc]
         return next(self._inputs, None)
 
     def __iter__(self) -> Iterator[Feeds]:
-        upscaler = self._upscaler
         self.played.clear()
         for clip in self._clips:
-            state, count = None, 0
+            count = 0
             for frame in islice(read_frames(clip), self._most):
-                state = state or upscaler.initial_state(frame.height, frame.width)
-                remembered = [tensor.copy() for tensor in state.tensors()]
-                yield {**_planes(frame, upscaler.spec), **{s.input: t for s, t in zip(upscaler.spec.state, remembered, strict=True)}}
-                _, state = upscaler.step(frame, state)
+                yield _feeds(frame, self._spec)
                 count += 1
-            if state is None:
+            if count == 0:
                 raise InputError(f"no frame of {clip} could be decoded")
             self.played.append(f"{clip.name} ({count} frames)")
         for made, width, height in self._made:
             for frame in made(width, height, MADE_FRAMES):
-                zeros = upscaler.initial_state(frame.height, frame.width).tensors()
-                yield {**_planes(frame, upscaler.spec), **{s.input: t.copy() for s, t in zip(upscaler.spec.state, zeros, strict=True)}}
+                yield _feeds(frame, self._spec)
             self.played.append(f"made {made.__name__}, {width}x{height} ({MADE_FRAMES} frames)")
 
 
-def _planes(frame: Frame, spec: ModelSpec) -> Feeds:
-    shapes = plane_shapes(spec.padded(frame.height), spec.padded(frame.width))
-    padded = [np.empty(shape, np.uint8) for shape in shapes]
+def _feeds(frame: Frame, spec: ModelSpec) -> Feeds:
+    height, width = spec.padded(frame.height), spec.padded(frame.width)
+    padded = [np.empty(shape, np.uint8) for shape in plane_shapes(height, width)]
     for plane, target in zip((frame.y, frame.u, frame.v), padded, strict=True):
         copy_padded(plane, target)
-    return {name: plane[None, None] for name, plane in zip("yuv", padded, strict=True)}
+    state = {s.input: np.zeros((1, s.channels, height // s.divisor, width // s.divisor), s.dtype) for s in spec.state}
+    return {**{name: plane[None, None] for name, plane in zip("yuv", padded, strict=True)}, **state}
 
 
 def _quantized_nodes(graph: onnx.GraphProto) -> list[str]:

@@ -121,6 +121,18 @@ def test_weights_are_symmetric_per_channel_and_what_must_stay_float_does(folder:
         assert float_weights == {"lstm.gates", "head", "luma_base", "chroma_base"}
 
 
+def test_nothing_in_8_bits_depends_on_the_state(folder: Path) -> None:
+    """It is calibrated with a state of zeros."""
+    graph = onnx.load(folder / "recurrent-int8.onnx").graph
+    source = {output: node for node in graph.node for output in node.output}
+    behind = {node.input[0] for node in graph.node if node.op_type == "QuantizeLinear"}
+    unseen = set(behind)
+    while unseen:
+        unseen = {name for tensor in unseen if tensor in source for name in source[tensor].input} - behind
+        behind |= unseen
+    assert {entry.name for entry in graph.input} & behind == {"y", "u", "v"}
+
+
 @pytest.mark.parametrize("name", NETWORKS)
 def test_it_is_the_same_model_to_the_client_but_for_its_precision(folder: Path, name: str) -> None:
     ours, theirs = (OnnxUpscaler(folder / f"{stem}.onnx", threads=1).spec for stem in (f"{name}-int8", name))
