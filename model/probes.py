@@ -170,7 +170,8 @@ def _agreement(subject: Subject, upscalers: Sequence[OnnxUpscaler], steps: int) 
         steps * len(upscalers),
         max_code_error=max(int(np.abs(other - pictures).max()) for other, _ in others),
         differing_share=max(float(np.mean(other != pictures)) for other, _ in others),
-        max_state_error=max(float(np.abs(other - state).max()) for _, other in others) if state.size else None,
+        max_state_error=float(np.max([np.abs(other - state).max() for _, other in others])) if state.size else None,
+        largest_state=float(np.abs(state).max()) if state.size else None,
     )
 
 

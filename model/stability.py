@@ -69,7 +69,7 @@ def table_row(case: Case, outcome: Outcome) -> str:
         "-" if outcome.max_code_error is None else str(outcome.max_code_error),
         *(
             "-" if value is None else f"{value:.1e}"
-            for value in (outcome.differing_share, outcome.max_state_error, outcome.rms_state_error, outcome.drift_per_1000_frames)
+            for value in (outcome.differing_share, outcome.state_error_share, outcome.rms_state_error, outcome.drift_per_1000_frames)
         ),
         "-" if outcome.largest_state is None else f"{outcome.largest_state:.3g}",
         str(outcome.nan_frames),

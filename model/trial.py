@@ -118,9 +118,16 @@ class Outcome:
     def passed(self) -> bool | None:
         return None if self.left_out else not self.failures
 
+    @property
+    def state_error_share(self) -> float | None:
+        """The state's largest error as a share of its largest value, of 1 where that is smaller: what is held against the bound."""
+        if self.max_state_error is None:
+            return None
+        return self.max_state_error / float(np.max((1.0, self.largest_state or 0.0)))
+
     def record(self) -> dict[str, object]:
         """Every figure by name, ready for JSON."""
-        return {**asdict(self), "passed": self.passed}
+        return {**asdict(self), "state_error_share": self.state_error_share, "passed": self.passed}
 
     def noting(self, remark: str, *checks: tuple[bool, str]) -> Outcome:
         """The same with a remark, and failed where a check (whether it holds, what is wrong where not) does not hold."""
@@ -145,7 +152,7 @@ def tally(subject: Subject, played: Iterable[Played], watch: Callable[[int, Play
         durations_ns.append(frame.duration_ns)
         nan_frames += frame.restarted
         for tensor in frame.state:
-            largest = max(largest or 0.0, float(np.abs(tensor).max()))
+            largest = float(np.max((largest or 0.0, np.abs(tensor).max())))  # Python's max would drop a NaN that does not come first
             subnormals += count_subnormals(tensor)
         if frame.error is not None:
             errors.append(frame.error)
@@ -161,7 +168,7 @@ def tally(subject: Subject, played: Iterable[Played], watch: Callable[[int, Play
 
 def broken_by(errors: Sequence[StepError], bounds: Bounds) -> list[str]:
     """What the errors of every step of one run of one provider break, each with what is allowed; none where they break nothing."""
-    largest = max(error.largest_state for error in errors)
+    largest = float(np.max([error.largest_state for error in errors]))
     return list(_broken(_with_errors(Outcome(0, 0, len(errors), largest_state=largest), errors), bounds))
 
 
@@ -169,15 +176,15 @@ def _with_errors(outcome: Outcome, errors: Sequence[StepError]) -> Outcome:
     outcome = replace(
         outcome,
         max_code_error=max(error.max_code_error for error in errors),
-        differing_share=float(np.mean([error.differing_pixels for error in errors])),
+        differing_share=float(np.average([error.differing_pixels for error in errors], weights=[error.samples for error in errors])),
         errors_at=tuple(error for error in errors if error.step in SHOWN_STEPS),
     )
     if outcome.largest_state is None:
         return outcome
     return replace(
         outcome,
-        max_state_error=max(error.max_state_error for error in errors),
-        rms_state_error=max(error.rms_state_error for error in errors),
+        max_state_error=float(np.max([error.max_state_error for error in errors])),
+        rms_state_error=float(np.max([error.rms_state_error for error in errors])),
         drift_per_1000_frames=_drift([error.rms_state_error for error in errors]),
     )
 
@@ -199,7 +206,7 @@ def _broken(outcome: Outcome, bounds: Bounds) -> Iterable[str]:
     for value, bound, what in (
         (outcome.max_code_error, bounds.codes, "codes of picture error"),
         (outcome.differing_share, bounds.differing, "of the samples differ"),
-        (outcome.max_state_error, bounds.state * max(1.0, outcome.largest_state or 0.0), "of state error"),
+        (outcome.state_error_share, bounds.state, "of state error"),
         (outcome.drift_per_1000_frames, bounds.drift, "of drift per 1,000 frames"),
     ):
         if value is not None and not (math.isfinite(value) and value <= bound):

@@ -29,8 +29,8 @@ class StepError:
     """What one step's result differs by: pictures in code values (planes Y, U, V together), states in their own units.
 
     `provider` is what ran the artifact. `p999_code_error` is the 99.9th percentile of all samples' errors, `psnr_y_db` that of
-    the luma against the reference's rounded picture, None where the two are equal. `largest_state` is the largest magnitude in
-    the artifact's state, which the bound of its error is relative to.
+    the luma against the reference's rounded picture, None where the two are equal. `differing_pixels` is a share of the `samples`
+    of all planes. `largest_state` is the largest magnitude in the artifact's state, which the bound of its error is relative to.
     """
 
     provider: str
@@ -43,6 +43,7 @@ class StepError:
     rms_state_error: float
     largest_state: float
 
+    samples: int
 
 def network_of_artifact(artifact: Path, weights: Path | None = None) -> Network:
     """The fused network in float64 with an artifact's weights; raises ModelError when it does not say what network it is.
@@ -187,8 +188,8 @@ def parity_row(frame: str, errors: Sequence[StepError]) -> str:
         str(max(error.p999_code_error for error in errors)),
         f"{max(error.differing_pixels for error in errors):.1e}",
         f"{min(found):.1f}" if found else "equal",
-        f"{max(error.max_state_error for error in errors):.1e}",
-        f"{max(error.rms_state_error for error in errors):.1e}",
+        f"{np.max([error.max_state_error for error in errors]):.1e}",
+        f"{np.max([error.rms_state_error for error in errors]):.1e}",
     )
     return f"| {' | '.join(cells)} |"
 
@@ -216,5 +217,6 @@ def step_error(
         psnr_db(squared / picture.y.size) if squared else None,
         float(np.abs(drift).max()),
         float(np.sqrt(np.square(drift).mean())),
-        max((float(np.abs(part).max()) for part in state), default=0.0),
+        float(np.max([np.abs(part).max() for part in state], initial=0.0)),
+        distances.size,
     )

@@ -227,7 +227,7 @@ def test_growing_errors_and_lost_states_are_failures(folder: Path) -> None:
 
     def played(slope: float) -> Iterator[Played]:
         for step in range(1, 301):
-            yield Played(picture, 1000, False, state, StepError("cpu", step, 0, 0, 0.0, None, 1e-7, 1e-7 + slope * step, 1.0))
+            yield Played(picture, 1000, False, state, StepError("cpu", step, 0, 0, 0.0, None, 1e-7, 1e-7 + slope * step, 1.0, 4608))
 
     assert tally(tested, played(0.0)).passed
     drifting = tally(tested, played(1e-8))
@@ -297,3 +297,10 @@ def test_hard_cases_take_one_provider(capsys: pytest.CaptureFixture[str]) -> Non
 def test_a_row_says_what_it_does_not_know() -> None:
     case = Case("name", "", lambda *_: Outcome(2, 2, 0), 1, 1)
     assert table_row(case, Outcome(160, 96, 1000)) == "| name | 160x96 | 1,000 | - | - | - | - | - | - | 0 | - | pass |"
+
+
+@pytest.mark.parametrize(("largest", "share"), [(8.0, "5.0e-06"), (0.5, "4.0e-05"), (np.nan, "nan")])
+def test_a_row_has_the_state_error_that_is_held_against_the_bound(largest: float, share: str) -> None:
+    outcome = Outcome(160, 96, 1000, max_state_error=4e-5, largest_state=largest)
+    case = Case("name", "", lambda *_: outcome, 1, 1)
+    assert table_row(case, outcome).split(" | ")[5] == share == f"{outcome.record()['state_error_share']:.1e}"
