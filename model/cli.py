@@ -185,6 +185,8 @@ def verify_main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="a JSON line a step and provider, or a hard case, instead of the table")
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     arguments = parser.parse_args(argv)
+    if arguments.steps < 1:
+        parser.error("--steps is at least 1")
     if arguments.hard is None and (arguments.clip is None or arguments.cases):
         parser.error("CLIP may be left out, and --cases given, with --hard only")
     if arguments.hard and len(arguments.provider) > 1:
@@ -194,7 +196,7 @@ def verify_main(argv: Sequence[str] | None = None) -> int:
 
 def _verify_parity(arguments: argparse.Namespace) -> None:
     width, height = parse_size(arguments.crop or "192x108")
-    frames = [crop(frame, width, height) for frame in read_frames(arguments.clip)]
+    frames = [crop(frame, width, height) for frame in islice(read_frames(arguments.clip), arguments.steps)]
     if not frames:
         raise InputError(f"no frame of {arguments.clip} could be decoded")
     _, spec = load_session(arguments.model, "cpu", 1)

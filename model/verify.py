@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -70,18 +71,21 @@ def network_of_artifact(artifact: Path, weights: Path | None = None) -> Network:
 
 def parse_size(text: str) -> tuple[int, int]:
     """Width and height of "320x180", both even; raises InputError."""
-    width, _, height = text.partition("x")
-    if not (width.isdigit() and height.isdigit()) or int(width) % 2 or int(height) % 2 or not int(width) * int(height):
+    sides = re.fullmatch("([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", text)
+    if sides is None or int(sides[1]) % 2 or int(sides[2]) % 2:
         raise InputError(f"{text!r} is not a size: write 320x180, both even")
-    return int(width), int(height)
+    return int(sides[1]), int(sides[2])
 
 
 def crop(frame: Frame, width: int, height: int) -> Frame:
-    """The middle of a frame, cut at even pixels, or all of it where it is smaller; width and height are even."""
+    """The middle of a frame, cut at even pixels, or all of it where it is smaller; width and height are even.
+
+    Its planes are copies: a view would keep the whole picture in memory for as long as the crop.
+    """
     top, left = (max(0, (have - want) // 4 * 2) for have, want in ((frame.height, height), (frame.width, width)))
     rows, columns = slice(top // 2, (top + height) // 2), slice(left // 2, (left + width) // 2)
     luma = frame.y[top : top + height, left : left + width]
-    return replace(frame, y=luma, u=frame.u[rows, columns], v=frame.v[rows, columns])
+    return replace(frame, y=luma.copy(), u=frame.u[rows, columns].copy(), v=frame.v[rows, columns].copy())
 
 
 class Reference:

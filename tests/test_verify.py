@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from client.errors import InputError
 from client.frames import Frame
+from client.models import find_model
+from model.cli import verify_main
+from model.hard_cases import noise, there_and_back
 from model.trial import BOUNDS, broken_by
-from model.verify import StepError, parity_row, step_error
+from model.verify import StepError, crop, parity_row, parse_size, step_error
 
 SOUND = StepError("cpu", 1, 0, 0, 0.0, None, 1e-7, 1e-8, 1.0, 1000)
 BOUND = BOUNDS["float32"]
@@ -50,3 +56,49 @@ def test_the_share_that_differs_is_one_of_samples_and_not_of_frames() -> None:
     assert not broken_by([small, large], BOUND)
     (broken,) = broken_by([replace(small, samples=10_000), replace(large, samples=6)], BOUND)
     assert broken == "0.5 of the samples differ, at most 0.001 allowed"
+
+
+NO_SIZES = ["", "x", "64", "64x", "x48", "0x48", "63x48", "64x47", "-64x48", "64 x48", "²x2", "64x48x2", "9" * 5000 + "0x2"]
+
+
+@pytest.mark.parametrize("text", NO_SIZES, ids=lambda text: text[:8])
+def test_what_is_no_size_is_refused(text: str) -> None:
+    assert parse_size("64x48") == (64, 48)
+    with pytest.raises(InputError, match="is not a size: write 320x180, both even"):
+        parse_size(text)
+
+
+def test_a_crop_keeps_nothing_else_in_memory() -> None:
+    (frame,) = noise(101, 75, 1)
+    for size in ((64, 48), (200, 200)):
+        cut = crop(frame, *size)
+        assert all(plane.base is None for plane in (cut.y, cut.u, cut.v))
+
+
+@pytest.mark.parametrize("length", [1, 2, 5, 6, 7, 30])
+def test_a_clip_is_read_no_further_than_it_is_played(length: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There are six frames; those that are played are the same as if all had been read."""
+    frames = list(noise(8, 6, 6))
+    read: list[Frame] = []
+
+    def read_frames(_: Path) -> Iterator[Frame]:
+        for frame in frames:
+            read.append(frame)
+            yield frame
+
+    def parity(_: Path, cut: list[Frame], steps: int, **__: object) -> Iterator[StepError]:
+        for step, (frame, expected) in enumerate(zip(there_and_back(cut, steps), there_and_back(frames, steps), strict=True), 1):
+            assert np.array_equal(frame.y, expected.y)
+            yield replace(SOUND, step=step)
+
+    monkeypatch.setattr("model.cli.read_frames", read_frames)
+    monkeypatch.setattr("model.cli.parity", parity)
+    assert verify_main([str(find_model("gamesr", 2)), "clip.mkv", "--steps", str(length)]) == 0
+    assert len(read) == min(length, 6)
+
+
+@pytest.mark.parametrize("steps", ["0", "-1"])
+def test_there_is_a_step_at_least(steps: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        verify_main(["model.onnx", "clip.mkv", "--steps", steps])
+    assert "--steps is at least 1" in capsys.readouterr().err
