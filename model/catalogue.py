@@ -21,10 +21,10 @@ def network_of_preset(preset: str, scale: int) -> Network:
 
 
 def described_network(description: dict[str, Any]) -> Network:
-    """An untrained network from its own `description`; raises ModelError for one of another version's."""
-    shape = dict(description)
-    architecture = shape.pop("architecture", None)
+    """An untrained network from its own `description`; raises ModelError for one of another version's, or none at all."""
     try:
+        shape = dict(description)
+        architecture = shape.pop("architecture", None)
         if architecture in PEERS:
             around, body = PEERS[architecture]
             return around(architecture, body, **shape)
@@ -32,6 +32,6 @@ def described_network(description: dict[str, Any]) -> Network:
             return Lean(LeanConfig(**shape))
         if architecture is None:
             return GameSR(NetworkConfig(**shape))
-    except TypeError as error:  # an argument that is none
-        raise ModelError(f"this version has no such network: {error}") from error
+    except (ArithmeticError, RuntimeError, TypeError, ValueError) as error:  # an argument that is none, or a size that none can have
+        raise ModelError(f"this version has no such network: {str(error).splitlines()[0]}") from error
     raise ModelError(f"this version has no network of the architecture {architecture}")

@@ -37,6 +37,10 @@ class LeanConfig:
     expanded: int = 64
     blocks: int = 2
 
+    def __post_init__(self) -> None:
+        if self.blocks < 0:
+            raise ValueError(f"a network of {self.blocks} blocks would be larger than its input")
+
     @property
     def features(self) -> int:
         return self.channels - CELL

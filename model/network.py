@@ -42,6 +42,8 @@ class NetworkConfig:
     skip: bool = False
 
     def __post_init__(self) -> None:
+        if self.colour not in ("planes", "rgb"):
+            raise ValueError(f"a network is of planes or of rgb, not of {self.colour}")
         if self.colour == "planes" and self.unshuffle % 2:
             raise ValueError("a planes network needs an even unshuffle, which brings luma to the size of chroma")
 

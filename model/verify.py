@@ -43,11 +43,11 @@ class StepError:
     max_state_error: float
     rms_state_error: float
     largest_state: float
-
     samples: int
 
+
 def network_of_artifact(artifact: Path, weights: Path | None = None) -> Network:
-    """The fused network in float64 with an artifact's weights; raises ModelError when it does not say what network it is.
+    """The fused network in float64 with an artifact's weights; raises ModelError when the artifact is not the network that it says.
 
     The weights of an int8 artifact are those of the float32 artifact that it was made from, `weights`.
     """
@@ -59,13 +59,21 @@ def network_of_artifact(artifact: Path, weights: Path | None = None) -> Network:
     if weights is None and spec.precision == "int8":
         raise ModelError(f"{artifact} has rounded weights: name the float32 artifact that it was made from with --weights")
     network = described_network(spec.card["network"]).deployed()
+    side = spec.size_multiple
+    remembered = [(1, part.channels, side // part.divisor, side // part.divisor) for part in spec.state]
+    zeros = network.initial_state(1, side, side) or ()
+    if (network.scale, network.size_multiple, [part.shape for part in zeros]) != (spec.scale, side, remembered):
+        raise ModelError(f"{artifact} has another scale or another state than the network that it says it is")
     initializers = onnx.load(weights or artifact).graph.initializer
-    found = {t.name.removeprefix("network."): torch.from_numpy(numpy_helper.to_array(t).copy()) for t in initializers}
+    found = {tensor.name.removeprefix("network."): tensor for tensor in initializers}
     shapes = {name: weight.shape for name, weight in network.state_dict().items()}
     missing = shapes.keys() - found.keys()
     if missing:
         raise ModelError(f"{artifact} lacks the weights {', '.join(sorted(missing))}")
-    network.load_state_dict({name: found[name].reshape(shape) for name, shape in shapes.items()})  # slopes of PReLU lie over channels
+    try:  # slopes of PReLU lie over channels
+        network.load_state_dict({name: torch.tensor(numpy_helper.to_array(found[name]).reshape(shape)) for name, shape in shapes.items()})
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"{artifact} has other weights than the network that it says it is") from error
     return network.double().eval()
 
 

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 
-from client.errors import InputError
+from client.errors import InputError, ModelError
 from client.frames import Frame
 from client.models import find_model
 from model.cli import verify_main
 from model.hard_cases import noise, there_and_back
 from model.trial import BOUNDS, broken_by
-from model.verify import StepError, crop, parity_row, parse_size, step_error
+from model.verify import StepError, crop, network_of_artifact, parity_row, parse_size, step_error
 
 SOUND = StepError("cpu", 1, 0, 0, 0.0, None, 1e-7, 1e-8, 1.0, 1000)
 BOUND = BOUNDS["float32"]
@@ -102,3 +104,56 @@ def test_there_is_a_step_at_least(steps: str, capsys: pytest.CaptureFixture[str]
     with pytest.raises(SystemExit):
         verify_main(["model.onnx", "clip.mkv", "--steps", steps])
     assert "--steps is at least 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("gamesr", "x"),
+        ("gamesr", 7),
+        ("gamesr", None),
+        ("gamesr", ["ab"]),
+        ("gamesr", {"architecture": ["lean"]}),
+        ("gamesr", {"scale": 3}),
+        ("gamesr", {"scale": "2"}),
+        ("gamesr", {"colour": "grey"}),
+        ("gamesr", {"channels": 16}),
+        ("gamesr", {"channels": -1}),
+        ("gamesr", {"blocks": 9}),
+        ("gamesr", {"recurrent": False}),
+        ("live", {"architecture": "fsrcnn"}),
+        ("live", {"scale": 3}),
+        ("live", {"channels": 16}),
+        ("live", {"blocks": -1}),
+    ],
+    ids=str,
+)
+def test_an_artifact_that_is_not_the_network_that_it_says_is_refused_in_a_sentence(
+    name: str, said: object, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    proto = onnx.load(find_model(name, 2))
+    entry = next(p for p in proto.metadata_props if p.key == "card")
+    card = json.loads(entry.value)
+    card["network"] = {**card["network"], **said} if isinstance(said, dict) else said
+    entry.value = json.dumps(card)
+    onnx.save(proto, tmp_path / "foreign.onnx")
+    with pytest.raises(ModelError):
+        network_of_artifact(tmp_path / "foreign.onnx")
+    assert verify_main([str(tmp_path / "foreign.onnx"), "--hard", "short", "--cases", "black"]) == 1
+    (sentence,) = capsys.readouterr().err.splitlines()
+    assert sentence.startswith("gamesr-verify: ")
+
+
+@pytest.mark.parametrize("dtype", [np.float32, object])
+def test_weights_that_are_none_are_refused(dtype: type, tmp_path: Path) -> None:
+    """The graph keeps its own; beside them lies what has the name of one, of another shape or of text."""
+    proto = onnx.load(find_model("gamesr", 2))
+    name = "network.lstm.gates.weight"
+    for node in proto.graph.node:
+        node.input[:] = ["moved" if wanted == name else wanted for wanted in node.input]
+    next(tensor for tensor in proto.graph.initializer if tensor.name == name).name = "moved"
+    shape = (128, 64, 3, 3) if dtype is object else (7,)
+    proto.graph.initializer.append(onnx.numpy_helper.from_array(np.full(shape, "1", dtype), name))
+    onnx.save(proto, tmp_path / "foreign.onnx")
+    with pytest.raises(ModelError, match="has other weights than the network that it says it is"):
+        network_of_artifact(tmp_path / "foreign.onnx")
