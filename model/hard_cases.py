@@ -112,7 +112,7 @@ def hud(width: int, height: int, length: int) -> Iterator[Frame]:
     for t, frame in enumerate(there_and_back(list(synthetic_frames(width, height, min(length, FPS))), length)):
         y = frame.y.copy()
         for row, said in ((2, "HEALTH 100"), (2 + 2 * HEIGHT, f"AMMO {t % 1000:3}")):
-            dots = letters(said, 1)[: height - row, : width - 2]
+            dots = letters(said, 1)[: max(0, height - row), : width - 2]
             y[row : row + dots.shape[0], 2 : 2 + dots.shape[1]] = np.where(dots, WHITE, BLACK)
         yield replace(frame, y=y)
 

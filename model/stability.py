@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.cloud import area_downscale
-from client.errors import ModelError
+from client.errors import InputError, ModelError
 from client.frames import Frame
 from client.quality import psnr_db, squared_error
 from client.synthetic import synthetic_frames
@@ -39,11 +39,11 @@ class Case:
 
 
 def run_cases(subject: Subject, cases: Iterable[Case]) -> Iterator[tuple[Case, Outcome]]:
-    """Each case and what came of it; an artifact that fails altogether fails the case, not the run."""
+    """Each case and what came of it; an artifact that fails altogether fails the case, not the run, and pictures too large leave it out."""
     for case in cases:
         try:
             outcome = case.run(subject, case.full if subject.full else case.short)
-        except LeftOut as reason:
+        except (LeftOut, InputError) as reason:
             outcome = Outcome(subject.width, subject.height, 0, left_out=str(reason))
         except ModelError as error:
             outcome = Outcome(subject.width, subject.height, 0, failures=(str(error),))
@@ -93,7 +93,8 @@ def _full_size(subject: Subject, steps: int) -> Outcome:
 
 
 def _blocking(subject: Subject, steps: int) -> Outcome:
-    frames = [crop(frame, subject.width, subject.height) for frame in pictures.blocking(_clip(subject), BITS_PER_PIXEL)]
+    whole = [crop(frame, frame.width // 2 * 2, frame.height // 2 * 2) for frame in _clip(subject)]  # x264 takes no odd 4:2:0
+    frames = [crop(frame, subject.width, subject.height) for frame in pictures.blocking(whole, BITS_PER_PIXEL)]
     return trial(subject, pictures.there_and_back(frames, steps), steps)
 
 
