@@ -56,11 +56,13 @@ class SkippingUpscaler:
     `settling_frames` frames where it has one, whose state then stays as it is, which comes near (a state looks further around with
     every frame). Where most of a frame changed, all of it is computed, in one run.
 
-    Raises ModelError for a model that does not say how far it reaches, and ProviderError for a runtime that compiles a model for
-    every size anew: windows are of many.
+    Raises ValueError for fewer than one of `settling_frames`, ModelError for a model that does not say how far it reaches, and
+    ProviderError for a runtime that compiles a model for every size anew: windows are of many.
     """
 
     def __init__(self, upscaler: OnnxUpscaler, *, settling_frames: int = SETTLING_FRAMES) -> None:
+        if settling_frames < 1:
+            raise ValueError(f"settling_frames is {settling_frames}, not 1 or more: a tile that is never computed never changes")
         self._reach = windowed_reach(upscaler)
         self.spec: ModelSpec = upscaler.spec
         self.provider, self.threads = upscaler.provider, upscaler.threads

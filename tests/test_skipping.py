@@ -193,6 +193,12 @@ def test_a_state_freezes_when_its_tile_has_settled_and_thaws_where_it_stood(tiny
     assert [state.computed_share for _, state in steps] == [1, 1, 1] + [0.5] * 7 + [1]
 
 
+@pytest.mark.parametrize("frames", [0, -1])
+def test_a_tile_that_is_never_computed_is_refused(spies: dict[str, Spy], frames: int) -> None:
+    with pytest.raises(ValueError, match="not 1 or more"):
+        SkippingUpscaler(spies["planes_x2"], settling_frames=frames)
+
+
 def test_a_still_settles_near_what_computing_all_gives(spies: dict[str, Spy]) -> None:
     spy = spies["planes_x2"]
     frames = [noise(0, 96, 96)] + [changed(noise(0, 96, 96), 0, 0, 2, 2, index) for index in range(1, 2 * SETTLING_FRAMES)]
