@@ -22,7 +22,7 @@ from model.export import export_network
 from model.network import GameSR, NetworkConfig
 from model.stability import CASES, HEADER, Case, run_cases, table_row
 from model.trial import BOUNDS, Outcome, Subject, bounds_of, tally
-from model.verify import Played, StepError, network_of_artifact, step_error
+from model.verify import Played, Reference, StepError, network_of_artifact, step_error
 from tests.moving import write_footage
 
 SIZE = (32, 24)
@@ -95,6 +95,26 @@ def test_denormals_are_gone_after_a_frame(folder: Path) -> None:
 def test_a_shipped_model_passes_where_states_move_most() -> None:
     found = outcomes(find_model("gamesr", 2), "cuts", "flashes", "full-range", "lost-state")
     assert len(found) == 4 and all(outcome.passed for outcome in found.values()), found
+
+
+@pytest.mark.parametrize("scale", [2, 3])
+def test_nothing_inside_a_shipped_network_comes_near_the_end_of_float16(scale: int) -> None:
+    """No input and no output of a layer is a tenth of it, nor is a cell; the largest are those of the base, in code values."""
+    network = network_of_artifact(find_model("gamesr", scale))
+    largest: list[float] = []
+
+    def look(_: torch.nn.Module, inputs: tuple[torch.Tensor, ...], output: torch.Tensor) -> None:
+        largest.append(float(torch.cat([tensor.flatten() for tensor in (*inputs, output)]).abs().max()))
+
+    for layer in network.modules():
+        if not list(layer.children()):
+            layer.register_forward_hook(look)
+    for make in (pictures.noise, pictures.checkerboard, pictures.saturated, pictures.flashes):
+        reference = Reference(network, SIZE[1], SIZE[0])
+        for frame in make(*SIZE, 8):
+            reference.step(frame)
+        largest += [float(np.abs(part).max()) for part in reference.state()]
+    assert 128 < np.max(largest) < np.finfo(np.float16).max / 10
 
 
 def test_a_clip_whose_pictures_would_be_too_large_leaves_its_case_out_alone(folder: Path) -> None:
