@@ -72,7 +72,8 @@ def parser() -> argparse.ArgumentParser:
     part.add_argument(
         "--skip-unchanged",
         action="store_true",
-        help="compute only the tiles that changed (in OpenVINO: no frame twice); without a state exact, else some pixels differ a little",
+        help="compute only the tiles that changed (in OpenVINO, or with a state on a GPU: no frame twice); without a state exact, "
+        "else some pixels differ a little",
     )
     part.add_argument(
         "--detail-share",

@@ -124,7 +124,7 @@ class PlaySummary:
         return "\n".join(lines)
 
     def posted(self) -> dict[str, object]:
-        """What `POST /api/v1/client-latencies` of gamesr-serve takes: of the last size, the times of the tier that showed most of it.
+        """What `POST /api/v1/client-latencies` of gamesr-serve takes: of the last size, the times of the tier that computed most of it.
 
         `total` is as the service's own sweep has it, decoding, upscaling and presenting. What waited before it, and what was left out, was
         the stream's doing as much as the model's, and is in none of this. Raises OutputError where no frame of that size was timed.
@@ -132,7 +132,7 @@ class PlaySummary:
         try:
             name, stamps = self.tally.most_shown()
         except ValueError as error:
-            raise OutputError("nothing is posted: no frame of the last size came after the models were ready") from error
+            raise OutputError("nothing is posted: no picture of the last size was computed after the models were ready") from error
         spec, (width, height) = self.specs[name], self.tally.sizes[-1]
         totals_ns = [passed.written_ns - passed.packet_ns for passed in stamps]
         machine = "".join(letter if " " <= letter <= "~" else "?" for letter in machine_name())[:120]

@@ -87,7 +87,7 @@ class Summary:
             resets = f"{self.damaged_frames} frames damaged, {self.state_resets} state resets"
             lines.append(f"  trouble  {self.decode_errors} packets not decoded, {resets}")
         if self.skipped_share is not None:
-            lines.append(f"  skipped  {100 * self.skipped_share:.1f}% of the tiles, which had not changed")
+            lines.append(f"  skipped  {100 * self.skipped_share:.1f}% of the tiles or frames, which had not changed")
         if self.network_share is not None:
             lines.append(f"  network  on {100 * self.network_share:.1f}% of the picture, where most detail is; bicubic elsewhere")
         lines += latency_table(stage_latencies(self.stamps))

@@ -18,6 +18,7 @@ from client.repeats import Shown
 from client.upscaler import OnnxUpscaler, State, plane_shapes
 
 TIMED_FRAMES = 5
+MOST_REPEATS = 15  # by other tiers than the best: from what they compute a governor learns in a pause too that a better one fits
 _PAUSE_S = 0.001
 
 
@@ -35,7 +36,8 @@ class TieredUpscaler:
     """Models by name, the best first, each made ready for the size of the stream; set `tier` to choose. A context manager.
 
     With the step after that, the chosen model's memory begins anew: no memory is used by another network, nor one that missed frames.
-    A model without memory is not run for a frame equal to the one before, whose picture is shown again.
+    A model without memory is not run for a frame equal to the one before, whose picture is shown again; but where it is not the
+    best, for one in `MOST_REPEATS` + 1 of them.
     All buffers are made by `prepare`, none by a switch. `display_height` chooses the scale, 2 or 3,
     that comes nearest to it; without, it is 2.
     It serves one stream at a time. Raises ModelError for what does not ship at the scale, and what `OnnxUpscaler` raises.
@@ -50,6 +52,7 @@ class TieredUpscaler:
         self._loaded: dict[int, list[OnnxUpscaler]] = {}
         self._states: dict[int, State] = {}
         self._shown: Shown | None = None  # by a model without memory
+        self._repeats = 0
         self._running, self._stream = 0, 0
         self._preparation: _Preparation | None = None
         self.computing = threading.Lock()  # one model at a time: what plays must not slow down what is being timed
@@ -132,8 +135,10 @@ class TieredUpscaler:
             raise ValueError("this state is of a stream that was begun anew since")
         if self.tier != self._running:
             self._begin_again()
-        if self._shown is not None and (again := self._shown.again(frame)) is not None:
+        if self._shown and (not self._running or self._repeats < MOST_REPEATS) and (again := self._shown.again(frame)):
+            self._repeats += 1
             return again, TieredState(state.height, state.width, state.stream)
+        self._repeats = 0
         upscaler = self._upscalers[self._running]
         with self.computing:
             picture, after = upscaler.step(frame, self._states[self._running])

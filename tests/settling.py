@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,20 +17,12 @@ from client.frames import Frame
 from client.models import find_model
 from client.quality import psnr_db, squared_error
 from client.upscaler import OnnxUpscaler
+from model.verify import crop
 from server.encoding import EncodedStream, clip_frames
 
 WIDTH, HEIGHT = 480, 272
 MOTION, STILL = 12, 200
 AFTER = (0, 1, 4, 8, 16)
-
-
-def middle(frame: Frame) -> Frame:
-    top, left = (frame.height - HEIGHT) // 4 * 2, (frame.width - WIDTH) // 4 * 2
-    parts = []
-    for plane, divisor in ((frame.y, 1), (frame.u, 2), (frame.v, 2)):
-        rows, columns = (slice(begin // divisor, (begin + size) // divisor) for begin, size in ((top, HEIGHT), (left, WIDTH)))
-        parts.append(plane[rows, columns].copy())
-    return replace(frame, y=parts[0], u=parts[1], v=parts[2])
 
 
 def inputs(originals: list[Frame], kbps: int | None) -> Iterator[Frame]:
@@ -71,7 +62,7 @@ def main() -> None:
     print("| " + " | ".join(heads) + " |")
     print("|---" * len(heads) + "|")
     for path in arguments.clips:
-        originals = [middle(frame) for frame in clip_frames(path, 1, MOTION)]
+        originals = [crop(frame, WIDTH, HEIGHT) for frame in clip_frames(path, 1, MOTION)]
         for kbps in (None, arguments.kbps):
             print(row(path.stem.removesuffix("_1080p"), originals, kbps, upscaler), flush=True)
 

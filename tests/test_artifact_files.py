@@ -146,3 +146,9 @@ def test_what_cannot_be_written_leaves_everything_as_it_was(
         with pytest.raises(type(stopped_by)):
             write_artifact(tiny_model(gain=0.9), tmp_path / f"{name}_x2.onnx", "another")
     assert files(tmp_path) == before
+
+
+def test_what_is_no_file_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "mine_x2.onnx").mkdir()
+    with pytest.raises(OutputError, match="is not a file"):
+        new_artifacts("mine", [2], tmp_path, source=Path("bicubic"), force=True)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from client.deadline import MOST_LEFT_OUT, DeadlineRule
 from client.governor import HOLD_NS, MAX_HOLD_NS, MISSES_IN_A_ROW, Governor, Switch
+from client.tiers import MOST_REPEATS
 
 MS = 1_000_000
 PERIOD_NS = 16_666_667
@@ -180,6 +181,21 @@ def test_pictures_shown_again_tempt_nobody_upwards() -> None:
         switch = governor.shown(number * PERIOD_NS, latency_ns=latency_ns, busy_ns=latency_ns, upscale_ns=upscale_ns, computed=not again)
         assert switch is None and (not number or governor.frame_ns == busy_ns)
     assert tier > 0
+
+
+def test_the_best_tier_comes_back_in_a_pause_too() -> None:
+    """Three frames missed, then a menu of which the tiers compute one frame in 16."""
+    governor, number = Governor(COSTS_NS, deadline_ns=PERIOD_NS, period_ns=PERIOD_NS, now_ns=0), 0
+    while governor.tier == 0:
+        governor.shown(number * PERIOD_NS, latency_ns=2 * PERIOD_NS, busy_ns=2 * PERIOD_NS, upscale_ns=PERIOD_NS)
+        number += 1
+    while governor.tier > 0 and number < 40 * SECOND:
+        again = number % (MOST_REPEATS + 1) > 0
+        upscale_ns = 0 if again else COSTS_NS[governor.tier]
+        latency_ns = OTHER_NS + upscale_ns
+        governor.shown(number * PERIOD_NS, latency_ns=latency_ns, busy_ns=latency_ns, upscale_ns=upscale_ns, computed=not again)
+        number += 1
+    assert number < 17 * SECOND
 
 
 @settings(max_examples=25, deadline=None)

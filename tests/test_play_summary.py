@@ -65,5 +65,5 @@ def test_one_models_times_are_posted(tiers: TieredUpscaler, monkeypatch: pytest.
 def test_nothing_of_another_size_is_posted(tiers: TieredUpscaler, monkeypatch: pytest.MonkeyPatch) -> None:
     summary, _ = played(tiers, monkeypatch)
     summary.tally.resize((32, 32))
-    with pytest.raises(OutputError, match="no frame of the last size"):
+    with pytest.raises(OutputError, match="no picture of the last size"):
         summary.posted()

@@ -96,6 +96,18 @@ def test_a_picture_that_comes_again_is_not_computed_without_a_memory(tiers: Tier
     assert state.computed_share == 1
 
 
+def test_a_pause_is_looked_into_now_and_then_below_the_best_tier(model_file: ModelFile) -> None:
+    still, files = picture(3, 32, 48), [str(model_file(f"{name}.onnx", stateful=False)) for name in "ab"]
+    with TieredUpscaler(files, display_height=None, provider="cpu", threads=1) as tiers:
+        tiers.prepare(32, 48)
+        for tier, computed in ((0, 1), (1, 4)):
+            state, shares, tiers.tier = tiers.initial_state(32, 48), [], tier
+            for _ in range(3 * (client.tiers.MOST_REPEATS + 1) + 1):
+                _, state = tiers.step(still, state)
+                shares.append(state.computed_share)
+            assert sum(shares) == computed
+
+
 def test_a_state_of_before_is_refused(tiers: TieredUpscaler) -> None:
     state = tiers.initial_state(32, 48)
     tiers.initial_state(32, 48)
