@@ -22,7 +22,7 @@ from tests.sweeping import done, plan_of, results, sweep_here
 @pytest.fixture
 def cluster(tmp_path: Path) -> Iterator[LocalCluster]:
     with LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, worker_dashboard_address=None, local_directory=str(tmp_path)
+        n_workers=2, threads_per_worker=1, dashboard_address=":0", worker_dashboard_address=None, local_directory=str(tmp_path)
     ) as cluster:
         yield cluster
 
@@ -75,7 +75,7 @@ def test_what_goes_wrong_there_is_a_sentence_here(
 def test_a_cluster_without_workers_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("server.cluster._CONNECT_S", 1)
     with (
-        LocalCluster(n_workers=0, dashboard_address=None, local_directory=str(tmp_path)) as empty,
+        LocalCluster(n_workers=0, dashboard_address=":0", local_directory=str(tmp_path)) as empty,
         pytest.raises(GamesrError, match="no worker"),
     ):
         DaskWorkers(empty.scheduler_address)
