@@ -15,7 +15,7 @@ from client.frames import Frame
 from client.video import read_frames
 from model.capture.checking import EMPTY, MARGIN_DB, alignment, liveliness
 from model.capture.cli import main
-from model.capture.filming import Shot
+from model.capture.filming import Shot, film
 from model.capture.games import SceneSpec, load_games
 from model.capture.library import Library, film_to_file
 from model.capture.rendering import shots_of
@@ -114,6 +114,28 @@ def film_all(scene: SceneSpec, folder: Path, heights: tuple[int, ...] = HEIGHTS)
         assert len(frames) == scene.frames and not isinstance(filmed, Frame)
         library.put(scene, shot, filmed)
     return library
+
+
+SERVER = """
+import os, socket, sys
+server = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+server.bind(("127.0.0.1", int(sys.argv[1])))
+area = int(os.environ["GAMESR_WIDTH"]) * int(os.environ["GAMESR_HEIGHT"])
+with os.fdopen(int(os.environ["GAMESR_FD"]), "wb") as pipe:
+    for _ in range(int(os.environ["GAMESR_COUNT"])):
+        pipe.write(bytes(area * 3 // 2))
+        pipe.flush()
+"""
+
+
+def test_games_with_servers_of_their_own_play_at_the_same_time(tmp_path: Path) -> None:
+    (tmp_path / "server.py").write_text(SERVER)
+    (scene, _) = load_games(write_game(tmp_path / "games"))
+    run = replace(scene.game.play, command=(sys.executable, str(tmp_path / "server.py"), "$port"))
+    scene = replace(scene, frames=200, game=replace(scene.game, play=run))  # more than a pipe holds: the first still runs beside the second
+    one, other = (film(scene, Shot(72), clock=Path(), display=":none", timeout_s=60) for _ in range(2))
+    assert next(one).height == next(other).height == 72
+    assert [1 + sum(1 for _ in frames) for frames in (one, other)] == [200, 200]
 
 
 def test_what_is_filmed_is_kept_described_and_not_filmed_again(scene: SceneSpec, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import hashlib
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import tempfile
 import threading
@@ -60,6 +61,13 @@ def build_frame_clock(folder: Path) -> Path:
         raise GamesrError(f"the frame clock does not compile: {done.stderr.strip().splitlines()[-1]}")
     partial.replace(library)
     return library
+
+
+def free_port() -> int:
+    """A UDP port of this machine that nothing uses now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as unused:
+        unused.bind(("127.0.0.1", 0))
+        return int(unused.getsockname()[1])
 
 
 def film(scene: SceneSpec, shot: Shot, *, clock: Path, display: str, timeout_s: float) -> Generator[Frame]:
@@ -145,7 +153,7 @@ def _game(
 ) -> Iterator[_Stage]:
     with tempfile.TemporaryDirectory(prefix="gamesr-footage-", ignore_cleanup_errors=True) as folder:
         home = Path(folder)
-        words = {"width": window[0], "height": window[1], "home": folder}
+        words = {"width": window[0], "height": window[1], "home": folder, "port": free_port()}
         for name, text in run.files.items():
             path = home / scene.fill(name, words)
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -25,7 +25,7 @@
     antialiased = true                      # a supersampled reference too
 
 A $word in a command, a file or an environment is the scene's value of that name (any key of the scene, of its game, and
-$width, $height, $home).
+$width, $height, $home; $port, a UDP port that nothing else uses, for a game that plays against a server of its own).
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class SceneSpec:
 
     def digest(self) -> str:
         """A hash of everything that decides what is filmed, the demo included, whatever the size."""
-        run, size = self.game.play, {"width": "$width", "height": "$height", "home": "$home"}
+        run, size = self.game.play, {"width": "$width", "height": "$height", "home": "$home", "port": "$port"}
         parts: list[object] = [self.game.process, self.game.fps, self.skip, self.frames]
         parts += [[self.fill(word, size) for word in run.command], {k: self.fill(v, size) for k, v in run.environment.items()}]
         parts.append({self.fill(k, size): self.fill(v, size) for k, v in run.files.items()})
