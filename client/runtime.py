@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from client.artifact import ORT_PROVIDERS, ModelSpec, load_session, read_artifact
 from client.errors import ModelError, ProviderError
+from client.norms import norms_in_place
 
 Array = NDArray[np.generic]
 BFLOAT16 = "openvino-bfloat16"
@@ -150,6 +151,7 @@ class OpenVinoRuntime:
                 self._compiled.pop(next(iter(self._compiled)))  # streams of that size keep what they have
             try:
                 model = self._core.read_model(self._content)
+                norms_in_place(self._ov, model)
                 model.reshape({name: list(shape) for name, shape in shapes.items()})
                 self._compiled[key] = self._core.compile_model(model, "CPU", self._options).create_infer_request()
             except Exception as error:  # the runtime's exceptions have no common base
