@@ -124,12 +124,12 @@ class OpenVinoRuntime:
     def __init__(self, content: bytes, *, threads: int, provider: str, counting: bool = False) -> None:
         self._ov = openvino()
         self._core = self._ov.Core()
-        precision = OPENVINO[provider]
-        if CAPABILITIES[precision] not in self._core.get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
+        self._precision = OPENVINO[provider]
+        if CAPABILITIES[self._precision] not in self._core.get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
             raise ProviderError(f"this processor does not compute in {provider.removeprefix('openvino-')}: use --provider openvino")
         self._content = content
         self._options = {
-            "INFERENCE_PRECISION_HINT": precision,
+            "INFERENCE_PRECISION_HINT": self._precision,
             "INFERENCE_NUM_THREADS": threads,
             "NUM_STREAMS": 1,
             "PERF_COUNT": counting,
@@ -151,7 +151,8 @@ class OpenVinoRuntime:
                 self._compiled.pop(next(iter(self._compiled)))  # streams of that size keep what they have
             try:
                 model = self._core.read_model(self._content)
-                norms_in_place(self._ov, model)
+                if self._precision != "f16":  # where it has not been measured
+                    norms_in_place(self._ov, model)
                 model.reshape({name: list(shape) for name, shape in shapes.items()})
                 self._compiled[key] = self._core.compile_model(model, "CPU", self._options).create_infer_request()
             except Exception as error:  # the runtime's exceptions have no common base
