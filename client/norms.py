@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 LAST, BACK = [0, 2, 3, 1], [0, 3, 1, 2]  # axes of the transpositions that bring channels to the end and back
+LAST_AXIS = ([-1], [-1, 0, 1])  # of the norm: as it is, or as the ends and the step of a range
 NORM = {"normalize_variance": True, "eps_mode": "INSIDE_SQRT"}
 
 
@@ -27,7 +28,13 @@ def norms_in_place(ov: ModuleType, model: Any) -> int:
         chain = [node.get_type_name() if node else "" for node in (first, scaled, shifted, last)]
         if chain != ["Transpose", "Multiply", "Add", "Transpose"] or not norm.get_attributes().items() >= NORM.items():
             continue
-        if [_integers(node.input_value(1).get_node()) for node in (first, norm, last)] != [LAST, [-1], BACK]:
+        axes = _numbers(norm.input_value(1))
+        if (_numbers(first.input_value(1)), _numbers(last.input_value(1))) != (LAST, BACK) or axes not in LAST_AXIS:
+            continue
+        count = norm.get_output_partial_shape(0)[-1]
+        if any(
+            len(_numbers(node.input_value(1))) != count or node.get_element_type().get_type_name() != "f32" for node in (scaled, shifted)
+        ):
             continue
         scale, shift = (ops.reshape(node.input_value(1), [-1, 1, 1], False) for node in (scaled, shifted))
         channels = ops.constant([1])
@@ -47,8 +54,9 @@ def _only_user(node: Any) -> Any:
     return next(iter(users)).get_node() if len(users) == 1 else None
 
 
-def _integers(node: Any) -> list[int]:
-    """What a constant or a range of constants holds; nothing for any other node."""
+def _numbers(value: Any) -> list[float]:
+    """What a constant holds, or each of the three constants of a range; nothing for any other value."""
+    node = value.get_node()
     if node.get_type_name() == "Range":
-        return list(range(*(number for value in node.input_values() for number in _integers(value.get_node()))))
-    return [int(number) for number in node.get_data().flat] if node.get_type_name() == "Constant" else []
+        return [number for part in node.input_values() if part.get_node().get_type_name() == "Constant" for number in _numbers(part)]
+    return list(node.get_data().flat) if node.get_type_name() == "Constant" else []

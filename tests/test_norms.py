@@ -34,16 +34,19 @@ def layer_norm(
     *,
     eps_mode: str = "inside_sqrt",
     variance: bool = True,
+    scale_shape: tuple[int, ...] = (8,),
+    scale_first: bool = False,
+    dtype: type = np.float32,
     seen: Callable[[Any], Any] = lambda x: x,
 ) -> Any:
-    """A model of one norm over 8 channels; what `seen` makes of the scaled values is added to them."""
+    """A model of one norm over 8 channels; `seen` is computed from the values before they are transposed back."""
     rng = np.random.default_rng(1)
-    scale, shift = (ops.constant(rng.normal(1, 0.3, 8).astype(np.float32)) for _ in range(2))
-    given = ops.parameter([1, 8, 5, 7], np.float32)
+    scale, shift = (ops.constant(rng.normal(1, 0.3, shape).astype(dtype)) for shape in (scale_shape, (8,)))
+    given = ops.parameter([1, 8, 5, 7], dtype)
     last = ops.transpose(given, ops.constant([0, 2, 3, 1]))
-    scaled = ops.multiply(ops.mvn(last, ops.constant(axes or [-1]), variance, 1e-5, eps_mode), scale)
-    shifted = ops.add(scaled, shift)
-    return openvino.Model([ops.transpose(seen(shifted), ops.constant(list(back)))], [given])
+    norm = ops.mvn(last, ops.constant(axes or [-1]), variance, 1e-5, eps_mode)
+    scaled = ops.multiply(scale, norm) if scale_first else ops.multiply(norm, scale)
+    return openvino.Model([ops.transpose(seen(ops.add(scaled, shift)), ops.constant(list(back)))], [given])
 
 
 def computed(model: Any, given: np.ndarray) -> np.ndarray:
@@ -66,6 +69,9 @@ def test_a_norm_in_place_gives_what_it_gave_behind_transpositions() -> None:
         {"back": (0, 3, 2, 1)},
         {"eps_mode": "outside_sqrt"},
         {"variance": False},
+        {"scale_shape": (5, 7, 8)},
+        {"scale_first": True},
+        {"dtype": np.float16},
         {"seen": lambda x: ops.add(x, ops.relu(x))},
     ],
     ids=lambda other: next(iter(other)),
