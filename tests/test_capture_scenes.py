@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from client.errors import InputError
-from model.capture.games import GAMES, SPLITS, choose, load_games
+from model.capture.games import GAMES, SPLITS, WORDS_OF_A_RUN, choose, load_games
 from model.capture.rendering import shots_of
 from tests.capturing import write_game
 
@@ -35,7 +35,7 @@ def test_every_word_of_every_scene_is_known() -> None:
     for scene in load_games():
         for run in (scene.game.play, scene.game.record):
             for text in (*run.command, *run.files, *run.files.values(), *run.environment.values()) if run else ():
-                scene.fill(text, {"width": 1, "height": 1, "home": "/"})
+                scene.fill(text, dict.fromkeys(WORDS_OF_A_RUN, 1))
 
 
 def test_a_game_ships_whole() -> None:

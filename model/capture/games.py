@@ -44,6 +44,7 @@ from client.errors import InputError
 GAMES = Path(__file__).parent / "games"
 SPLITS = ("train", "validate", "test")
 HEIGHTS = (1080, 540, 360)
+WORDS_OF_A_RUN = ("width", "height", "home", "port")  # known when a game starts, and no part of what is filmed
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ class SceneSpec:
 
     def digest(self) -> str:
         """A hash of everything that decides what is filmed, the demo included, whatever the size."""
-        run, size = self.game.play, {"width": "$width", "height": "$height", "home": "$home", "port": "$port"}
+        run, size = self.game.play, {word: f"${word}" for word in WORDS_OF_A_RUN}
         parts: list[object] = [self.game.process, self.game.fps, self.skip, self.frames]
         parts += [[self.fill(word, size) for word in run.command], {k: self.fill(v, size) for k, v in run.environment.items()}]
         parts.append({self.fill(k, size): self.fill(v, size) for k, v in run.files.items()})
