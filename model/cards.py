@@ -17,10 +17,7 @@ def training_card(checkpoint: dict[str, Any]) -> Card:
     config = TrainConfig(**checkpoint["config"])
     return {
         "command": training_command(config),
-        "before": [
-            {"command": training_command(TrainConfig(**run["config"])), "steps": run["step"], "training_seconds": round(run["seconds"])}
-            for run in checkpoint["before"]
-        ],
+        "before": [_earlier_run(run) for run in checkpoint["before"]],
         "commit": checkpoint["commit"],
         "device": checkpoint["device"] + (", bfloat16" if config.bfloat16 else ""),
         "steps": checkpoint["step"],
@@ -28,6 +25,13 @@ def training_card(checkpoint: dict[str, Any]) -> Card:
         "footage": checkpoint["footage"],
         "held_out": checkpoint["held_out"],
     }
+
+
+def _earlier_run(run: dict[str, Any]) -> Card:
+    """A run that another was built on: as an artifact's card says it, or as a checkpoint does."""
+    if "config" not in run:
+        return run
+    return {"command": training_command(TrainConfig(**run["config"])), "steps": run["step"], "training_seconds": round(run["seconds"])}
 
 
 def training_command(config: TrainConfig) -> str:

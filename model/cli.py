@@ -21,6 +21,7 @@ from client.runtime import PROVIDERS
 from client.upscaler import OnnxUpscaler
 from client.video import read_frames
 from model.artifact_files import new_artifacts
+from model.artifact_weights import network_of_artifact
 from model.cards import card_page, training_card
 from model.catalogue import NAMES
 from model.evaluate import evaluate, table
@@ -30,7 +31,7 @@ from model.losses import LOSSES
 from model.stability import CASES, CLIP_FRAMES, HEADER, run_cases, table_row
 from model.train import TrainConfig, Trainer, load_checkpoint, network_of
 from model.trial import SHOWN_STEPS, Subject, bounds_of, broken_by
-from model.verify import PARITY_HEADER, StepError, crop, network_of_artifact, parity, parity_row, parse_size
+from model.verify import PARITY_HEADER, StepError, crop, parity, parity_row, parse_size
 
 TRAIN_EXAMPLES = """\
 The footage list is a TOML file of scenes (gamesr-footage makes one); scenes are split by map or track. A run lives in one
@@ -91,7 +92,10 @@ def train_main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--bfloat16", action="store_true", help="mixed precision: about twice as fast on AMX CPUs and on GPUs")
     parser.add_argument(
-        "--initial-weights", default="", metavar="CHECKPOINT", help="start from another run's checkpoint.pt, as far as shapes fit"
+        "--initial-weights",
+        default="",
+        metavar="FILE",
+        help="start from another run's checkpoint.pt or from an artifact (client/weights/live_x2.onnx), as far as shapes fit",
     )
     parser.add_argument("--cache", type=Path, default=Path("runs/cache"), help="decoded footage, may be deleted (default: %(default)s)")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu", help="cpu or cuda (default here: %(default)s)")

@@ -133,3 +133,12 @@ class LearnedInterpolation(Interpolation):
         del plain.weight
         plain.weight = nn.Parameter(self.kernel().detach().clone())
         return plain
+
+    def load_fused(self, plain: Interpolation) -> None:
+        """Take the kernel of a fused interpolation."""
+        self.load_kernel(plain.kernel())
+
+    @torch.no_grad()
+    def load_kernel(self, kernel: Tensor) -> None:
+        """Take a kernel, as long as its weights sum to one."""
+        self.correction.copy_((kernel - self.weight) / self.GAIN)

@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from model.interpolation import LearnedInterpolation, chroma_shift, exact
 from model.planes import INPUT_GAIN, RESIDUAL_GAIN, Network, Planes, State
-from model.reparam import LinearTriple, fuse
+from model.reparam import LinearTriple, fuse, load_fused
 
 ARCHITECTURE = "lean"
 LEAK = 0.1  # of the ReLUs: without it, and without a norm, whole blocks died within a thousand steps
@@ -54,11 +54,8 @@ class LeanBlock(nn.Module):
 
     def __init__(self, channels: int, expanded: int) -> None:
         super().__init__()
-        self.conv = LinearTriple(channels, expanded, padding=0)
         # It begins as nothing but the leak: depth costs no stability, and blocks can be added to a trained network.
-        nn.init.zeros_(self.conv.compress.weight)
-        assert self.conv.compress.bias is not None
-        nn.init.zeros_(self.conv.compress.bias)
+        self.conv = LinearTriple(channels, expanded, padding=0, nothing=True)
 
     def forward(self, x: Tensor) -> Tensor:
         return F.leaky_relu(x[:, :, 1:-1, 1:-1] + self.conv(x), LEAK)
@@ -69,6 +66,12 @@ class LeanBlock(nn.Module):
         with torch.no_grad():
             conv.weight[:, :, 1, 1] += torch.eye(conv.in_channels).to(conv.weight)
         return conv
+
+    def load_fused(self, plain: nn.Conv2d) -> None:
+        """Take the weights of a convolution that runs, and the identity out of them."""
+        weight, bias = weight_and_bias(plain)
+        weight[:, :, 1, 1] -= torch.eye(len(weight))
+        self.conv.load_fused(convolution(weight, bias))
 
 
 class FlatInterpolation(LearnedInterpolation):
@@ -128,15 +131,29 @@ class Lean(Network):
         onward = torch.zeros_like(bases[:CELL])
         onward[:, :, 1, 1] = torch.eye(CELL)
         weight, bias = weight_and_bias(self.stem)
-        self.stem = self._convolution(torch.cat((INPUT_GAIN / 255 * weight, onward)), bias - 0.5 * INPUT_GAIN * weight.sum((1, 2, 3)))
+        stem = convolution(torch.cat((INPUT_GAIN / 255 * weight, onward)), bias - 0.5 * INPUT_GAIN * weight.sum((1, 2, 3)))
         for index, block in enumerate(self.blocks):
             weight, bias = weight_and_bias(block)
-            self.blocks[index] = self._convolution(block_diagonal([weight, onward]), bias)
+            self.blocks[index] = convolution(block_diagonal([weight, onward]), bias).to(self.weight)
         weight, bias = weight_and_bias(self.head)
-        self.head = self._convolution(torch.cat((255 * RESIDUAL_GAIN * weight, bases), 1), 255 * RESIDUAL_GAIN * bias)
+        head = convolution(torch.cat((255 * RESIDUAL_GAIN * weight, bases), 1), 255 * RESIDUAL_GAIN * bias)
+        self.stem, self.head = stem.to(self.weight), head.to(self.weight)
         del self.luma_base, self.chroma_base
         self.carrying = True
         return self
+
+    def load_deployed(self, deployed: Self) -> None:
+        features = self.config.features
+        weight, bias = weight_and_bias(deployed.stem)
+        weight = 255 / INPUT_GAIN * weight[:features]
+        load_fused(self.stem, convolution(weight, bias[:features] + 0.5 * INPUT_GAIN * weight.sum((1, 2, 3))))
+        plain = [weight_and_bias(block) for block in deployed.blocks]
+        load_fused(self.blocks, nn.ModuleList(convolution(weight[:features, :features], bias[:features]) for weight, bias in plain))
+        weight, bias = weight_and_bias(deployed.head)
+        load_fused(self.head, convolution(weight[:, :features] / (255 * RESIDUAL_GAIN), bias / (255 * RESIDUAL_GAIN)))
+        luma, chroma = self.sides[0] ** 2, self.sides[1] ** 2
+        self.luma_base.load_kernel(weight[:luma, features:-2])
+        self.chroma_base.load_kernel(weight[luma : luma + chroma, -2:-1])
 
     def _cells(self, frame: Planes) -> Tensor:
         """Cells (N, 6, H/2 + 2R, W/2 + 2R) of the planes, extended by the R cells that the layers reach."""
@@ -144,14 +161,15 @@ class Lean(Network):
         planes = [F.pad(plane, (reach * block,) * 4, mode="replicate") for plane, block in zip(frame, BLOCKS, strict=True)]
         return torch.cat([F.pixel_unshuffle(plane, block) for plane, block in zip(planes, BLOCKS, strict=True)], 1)
 
-    def _convolution(self, weight: Tensor, bias: Tensor) -> nn.Conv2d:
-        """One with the given weights, without padding; outputs beyond the biases have none."""
-        conv = nn.Conv2d(weight.shape[1], weight.shape[0], 3).to(self.weight)
-        assert conv.bias is not None
-        with torch.no_grad():
-            conv.weight.copy_(weight)
-            conv.bias.zero_()[: len(bias)] = bias
-        return conv
+
+def convolution(weight: Tensor, bias: Tensor) -> nn.Conv2d:
+    """One with the given weights, in their dtype and without padding; outputs beyond the biases have none."""
+    conv = nn.Conv2d(weight.shape[1], weight.shape[0], 3, dtype=weight.dtype)
+    assert conv.bias is not None
+    with torch.no_grad():
+        conv.weight.copy_(weight)
+        conv.bias.zero_()[: len(bias)] = bias
+    return conv
 
 
 def weight_and_bias(conv: nn.Module) -> tuple[Tensor, Tensor]:

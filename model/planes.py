@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Self
 
 from torch import Tensor, nn
 
-from model.reparam import fuse
+from model.reparam import fuse, load_fused
 
 # Detail is a few hundredths of the code range: brought nearer to the unit scale of the layers, both ways, it trains faster.
 INPUT_GAIN = 4.0
@@ -74,3 +74,7 @@ class Network(nn.Module):
         """The network in the form that runs, in place."""
         fuse(self)
         return self
+
+    def load_deployed(self, deployed: Self) -> None:
+        """Take the weights of the same network in the form that runs, to train on from: the way back from `deployed`."""
+        load_fused(self, deployed)

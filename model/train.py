@@ -17,6 +17,7 @@ import torch
 from tqdm import tqdm
 
 from client.errors import InputError, ModelError
+from model.artifact_weights import trainable_weights
 from model.catalogue import NAMES, described_network, network_of_preset
 from model.footage import Degradation, FootageCache, Pair, by_game, load_pairs, load_scenes, sample_clips
 from model.losses import LOSSES, charbonnier, mean_log_mse
@@ -97,7 +98,7 @@ class Trainer:
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.before: list[dict[str, Any]] = []  # the runs that this one builds on, oldest first
         if config.initial_weights:
-            self._start_from(load_checkpoint(Path(config.initial_weights)))
+            self._start_from(Path(config.initial_weights))
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), config.learning_rate, betas=(0.9, 0.999), weight_decay=config.weight_decay
         )
@@ -122,14 +123,19 @@ class Trainer:
         self.optimizer.load_state_dict(saved["optimizer"])
         self.step, self.seconds, self.held_out = saved["step"], saved["seconds"], saved["held_out"]
 
-    def _start_from(self, earlier: dict[str, Any]) -> None:
+    def _start_from(self, path: Path) -> None:
         """Take over every weight of the same name and shape; a network of another scale keeps its own head and base."""
+        if path.suffix == ".onnx":
+            weights, self.before = trainable_weights(path)
+        else:
+            earlier = load_checkpoint(path)
+            weights = earlier["network"]
+            self.before = [*earlier["before"], {"config": earlier["config"], "step": earlier["step"], "seconds": earlier["seconds"]}]
         own = self.network.state_dict()
-        fitting = {name: value for name, value in earlier["network"].items() if name in own and own[name].shape == value.shape}
+        fitting = {name: value for name, value in weights.items() if name in own and own[name].shape == value.shape}
         if not fitting:
-            raise ModelError(f"{self.config.initial_weights} has no weight that fits this network")
+            raise ModelError(f"{path} has no weight that fits this network")
         self.network.load_state_dict({**own, **fitting})
-        self.before = [*earlier["before"], {"config": earlier["config"], "step": earlier["step"], "seconds": earlier["seconds"]}]
 
     def save(self) -> None:
         state = {

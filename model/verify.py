@@ -9,17 +9,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import onnx
 import torch
 from numpy.typing import NDArray
-from onnx import numpy_helper
 
-from client.artifact import load_session
 from client.errors import InputError, ModelError
 from client.frames import Frame, Plane
 from client.quality import psnr_db, squared_error
 from client.upscaler import OnnxUpscaler, State
-from model.catalogue import described_network
+from model.artifact_weights import network_of_artifact
 from model.export import to_codes
 from model.hard_cases import there_and_back
 from model.planes import Network, Planes
@@ -44,37 +41,6 @@ class StepError:
     rms_state_error: float
     largest_state: float
     samples: int
-
-
-def network_of_artifact(artifact: Path, weights: Path | None = None) -> Network:
-    """The fused network in float64 with an artifact's weights; raises ModelError when the artifact is not the network that it says.
-
-    The weights of an int8 artifact are those of the float32 artifact that it was made from, `weights`.
-    """
-    _, spec = load_session(artifact, "cpu", 1)
-    if "network" not in spec.card:
-        raise ModelError(f"{artifact} is no network: only a trained artifact has weights to verify")
-    if weights is not None and load_session(weights, "cpu", 1)[1].sha256 != spec.card.get("quantized_from"):
-        raise ModelError(f"{artifact} was not made from {weights}")
-    if weights is None and spec.precision == "int8":
-        raise ModelError(f"{artifact} has rounded weights: name the float32 artifact that it was made from with --weights")
-    network = described_network(spec.card["network"]).deployed()
-    side = spec.size_multiple
-    remembered = [(1, part.channels, side // part.divisor, side // part.divisor) for part in spec.state]
-    zeros = network.initial_state(1, side, side) or ()
-    if (network.scale, network.size_multiple, [part.shape for part in zeros]) != (spec.scale, side, remembered):
-        raise ModelError(f"{artifact} has another scale or another state than the network that it says it is")
-    initializers = onnx.load(weights or artifact).graph.initializer
-    found = {tensor.name.removeprefix("network."): tensor for tensor in initializers}
-    shapes = {name: weight.shape for name, weight in network.state_dict().items()}
-    missing = shapes.keys() - found.keys()
-    if missing:
-        raise ModelError(f"{artifact} lacks the weights {', '.join(sorted(missing))}")
-    try:  # slopes of PReLU lie over channels
-        network.load_state_dict({name: torch.tensor(numpy_helper.to_array(found[name]).reshape(shape)) for name, shape in shapes.items()})
-    except (TypeError, ValueError) as error:
-        raise ModelError(f"{artifact} has other weights than the network that it says it is") from error
-    return network.double().eval()
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -13,8 +13,9 @@ import torch
 from client.errors import ModelError
 from client.frames import Frame
 from client.upscaler import OnnxUpscaler
+from model.artifact_weights import network_of_artifact
 from model.export import export_baseline, export_network
-from model.verify import network_of_artifact, parity
+from model.verify import parity
 from tests.networks import random_clip, random_network
 
 

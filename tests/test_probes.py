@@ -13,11 +13,12 @@ import pytest
 from client.frames import Frame
 from client.runtime import BFLOAT16, OrtRuntime, Tensor
 from client.upscaler import OnnxUpscaler
+from model.artifact_weights import network_of_artifact
 from model.export import export_network
 from model.planes import Network
 from model.stability import CASES, run_cases
 from model.trial import Outcome, Subject
-from model.verify import Played, network_of_artifact, parity, play
+from model.verify import Played, parity, play
 from tests.moving import picture
 from tests.networks import random_network
 

@@ -17,9 +17,10 @@ from client.quality import psnr_db, squared_error
 from client.runtime import BFLOAT16
 from client.upscaler import OnnxUpscaler
 from client.video import read_frames
+from model.artifact_weights import network_of_artifact
 from model.stability import CASES, run_cases
 from model.trial import BOUNDS, Subject
-from model.verify import crop, network_of_artifact, parity
+from model.verify import crop, parity
 
 REFERENCE = Path(__file__).parent / "footage" / "oa_koth1_1080p.mp4"
 UNTRAINED, NETWORKS = ("bicubic", "lanczos", "easu", "fsr1"), ("gamesr", "gamesr-paper", "quality", "balanced", "live")

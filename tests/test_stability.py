@@ -17,12 +17,13 @@ from client.models import find_model
 from client.quality import psnr_db
 from client.upscaler import OnnxUpscaler
 from model import hard_cases as pictures
+from model.artifact_weights import network_of_artifact
 from model.cli import verify_main
 from model.export import export_network
 from model.network import GameSR, NetworkConfig
 from model.stability import CASES, HEADER, Case, run_cases, table_row
 from model.trial import BOUNDS, Outcome, Subject, bounds_of, tally
-from model.verify import Played, Reference, StepError, network_of_artifact, step_error
+from model.verify import Played, Reference, StepError, step_error
 from tests.moving import write_footage
 
 SIZE = (32, 24)

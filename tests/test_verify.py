@@ -14,10 +14,11 @@ import pytest
 from client.errors import InputError, ModelError
 from client.frames import Frame
 from client.models import find_model
+from model.artifact_weights import network_of_artifact
 from model.cli import verify_main
 from model.hard_cases import noise, there_and_back
 from model.trial import BOUNDS, broken_by
-from model.verify import StepError, crop, network_of_artifact, parity_row, parse_size, step_error
+from model.verify import StepError, crop, parity_row, parse_size, step_error
 
 SOUND = StepError("cpu", 1, 0, 0, 0.0, None, 1e-7, 1e-8, 1.0, 1000)
 BOUND = BOUNDS["float32"]

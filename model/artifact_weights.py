@@ -1,0 +1,61 @@
+"""The weights inside an artifact: as the network that runs, to be held against, and as one that training goes on from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import onnx
+import torch
+from onnx import numpy_helper
+
+from client.artifact import load_session
+from client.errors import ModelError
+from model.catalogue import described_network
+from model.planes import Network
+
+RUN = ("command", "steps", "training_seconds")  # what a card says of a run that another is built on
+
+
+def network_of_artifact(artifact: Path, weights: Path | None = None) -> Network:
+    """The fused network in float64 with an artifact's weights; raises ModelError when the artifact is not the network that it says.
+
+    The weights of an int8 artifact are those of the float32 artifact that it was made from, `weights`.
+    """
+    _, spec = load_session(artifact, "cpu", 1)
+    if "network" not in spec.card:
+        raise ModelError(f"{artifact} is no network: only a trained artifact has weights to verify")
+    if weights is not None and load_session(weights, "cpu", 1)[1].sha256 != spec.card.get("quantized_from"):
+        raise ModelError(f"{artifact} was not made from {weights}")
+    if weights is None and spec.precision == "int8":
+        raise ModelError(f"{artifact} has rounded weights: name the float32 artifact that it was made from with --weights")
+    network = described_network(spec.card["network"]).deployed()
+    side = spec.size_multiple
+    remembered = [(1, part.channels, side // part.divisor, side // part.divisor) for part in spec.state]
+    zeros = network.initial_state(1, side, side) or ()
+    if (network.scale, network.size_multiple, [part.shape for part in zeros]) != (spec.scale, side, remembered):
+        raise ModelError(f"{artifact} has another scale or another state than the network that it says it is")
+    initializers = onnx.load(weights or artifact).graph.initializer
+    found = {tensor.name.removeprefix("network."): tensor for tensor in initializers}
+    shapes = {name: weight.shape for name, weight in network.state_dict().items()}
+    missing = shapes.keys() - found.keys()
+    if missing:
+        raise ModelError(f"{artifact} lacks the weights {', '.join(sorted(missing))}")
+    try:  # slopes of PReLU lie over channels
+        network.load_state_dict({name: torch.tensor(numpy_helper.to_array(found[name]).reshape(shape)) for name, shape in shapes.items()})
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"{artifact} has other weights than the network that it says it is") from error
+    return network.double().eval()
+
+
+def trainable_weights(artifact: Path) -> tuple[dict[str, torch.Tensor], list[dict[str, Any]]]:
+    """The weights of a network in its training form that is the artifact's when deployed, and the runs that made them, oldest first.
+
+    Raises ModelError for an artifact that holds no network's float32 weights. What chance there is in the weights is torch's.
+    """
+    deployed = network_of_artifact(artifact)
+    card = load_session(artifact, "cpu", 1)[1].card
+    network = described_network(card["network"])
+    network.load_deployed(deployed)
+    runs = [*card.get("before", ()), {name: card[name] for name in RUN if name in card}]
+    return network.state_dict(), [run for run in runs if run.keys() == set(RUN)]

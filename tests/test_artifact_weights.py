@@ -1,0 +1,90 @@
+"""Training on from an artifact: its network's training form gives what it gives, learns, and says where it began."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from client.errors import GamesrError, ModelError
+from client.models import find_model
+from client.upscaler import OnnxUpscaler
+from model.artifact_weights import network_of_artifact, trainable_weights
+from model.catalogue import network_of_preset
+from model.complexity import parameter_count
+from model.export import export_baseline, export_network
+from model.footage import FootageCache
+from model.train import TrainConfig, Trainer
+from tests.moving import write_footage
+from tests.networks import random_clip, random_network
+
+TINY = TrainConfig(degradations=("area",), steps=4, batch=2, patch=16, frames=4, window=2, warm_up_steps=2)
+
+
+@pytest.fixture(scope="module")
+def footage(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_footage(tmp_path_factory.mktemp("footage"))
+
+
+@pytest.mark.parametrize(
+    ("preset", "scale"), [("planes", 2), ("planes-static", 3), ("paper", 2), ("live", 3), ("balanced", 2), ("srvgg", 2), ("imdn", 3)]
+)
+def test_the_training_form_gives_what_the_artifact_gives(preset: str, scale: int, tmp_path: Path) -> None:
+    path = tmp_path / "network.onnx"
+    network = random_network(preset, scale)
+    export_network(network, path, name=preset, card={})
+    weights, before = trainable_weights(path)
+    assert before == []
+    again = network_of_preset(preset, scale)
+    assert parameter_count(again) == parameter_count(network)
+    again.load_state_dict(weights)
+    clip = random_clip(1, 3, 24, 40)
+    expected, _ = network_of_artifact(path)(clip)
+    for form in (again.double(), again.deployed()):
+        found, _ = form(clip)
+        for a, b in zip(found, expected, strict=True):
+            torch.testing.assert_close(a, b, rtol=0, atol=0.02)  # codes; a rounded kernel may fall to its neighbour in bfloat16
+
+
+@pytest.mark.parametrize("name", ["live", "gamesr"])
+def test_a_run_goes_on_from_an_artifact_that_ships(name: str, footage: Path, tmp_path: Path) -> None:
+    artifact = find_model(name, 2)
+    preset = {"live": "live", "gamesr": "planes"}[name]
+    config = TrainConfig(**{**TINY.__dict__, "preset": preset, "initial_weights": str(artifact), "learning_rate": 1e-4})
+    cache = FootageCache(tmp_path / "cache")
+    trainer = Trainer(config, footage, cache, tmp_path / "run")
+    plain = Trainer(TrainConfig(**{**TINY.__dict__, "preset": preset, "learning_rate": 1e-4}), footage, cache, tmp_path / "plain")
+    assert next(trainer.losses()) < next(plain.losses())
+    card = OnnxUpscaler(artifact, threads=1).spec.card
+    assert [run["command"] for run in trainer.before] == [*(run["command"] for run in card["before"]), card["command"]]
+    began = network_of_preset(preset, 2)
+    began.load_state_dict(trainable_weights(artifact)[0])
+    moved = [not torch.equal(now, described) for now, described in zip(trainer.network.parameters(), began.parameters(), strict=True)]
+    assert all(moved)
+
+
+def test_blocks_that_the_artifact_does_not_have_begin_as_nothing(footage: Path, tmp_path: Path) -> None:
+    artifact = find_model("live", 2)
+    config = TrainConfig(**{**TINY.__dict__, "preset": "balanced", "initial_weights": str(artifact)})
+    deeper = Trainer(config, footage, FootageCache(tmp_path / "cache"), tmp_path / "run").network
+    weights, _ = trainable_weights(artifact)
+    assert torch.equal(deeper.head.weight, weights["head.weight"])
+    assert [bool(block.conv.compress.weight.any()) for block in deeper.blocks] == [True, True, False, False, False, False]
+
+
+def test_an_artifact_without_weights_to_train_is_refused(footage: Path, tmp_path: Path) -> None:
+    export_baseline("bicubic", 2, tmp_path / "bicubic.onnx", name="bicubic")
+    (tmp_path / "foreign.onnx").write_bytes(b"no model at all")
+    for path, message in (
+        (tmp_path / "bicubic.onnx", "is no network"),
+        (find_model("live-int8", 2), "has rounded weights"),
+        (tmp_path / "foreign.onnx", "foreign.onnx"),
+        (tmp_path / "missing.onnx", "missing.onnx"),
+    ):
+        config = TrainConfig(**{**TINY.__dict__, "initial_weights": str(path)})
+        with pytest.raises(GamesrError, match=message):
+            Trainer(config, footage, FootageCache(tmp_path / "cache"), tmp_path / "run")
+    config = TrainConfig(**{**TINY.__dict__, "preset": "fsrcnn", "initial_weights": str(find_model("live", 2))})
+    with pytest.raises(ModelError, match="no weight that fits"):
+        Trainer(config, footage, FootageCache(tmp_path / "cache"), tmp_path / "run")
