@@ -11,7 +11,7 @@ from onnx import numpy_helper
 
 from client.artifact import load_session
 from client.errors import ModelError
-from model.catalogue import described_network
+from model.catalogue import described_network, preset_of
 from model.planes import Network
 
 RUN = ("command", "steps", "training_seconds")  # what a card says of a run that another is built on
@@ -48,14 +48,21 @@ def network_of_artifact(artifact: Path, weights: Path | None = None) -> Network:
     return network.double().eval()
 
 
-def trainable_weights(artifact: Path) -> tuple[dict[str, torch.Tensor], list[dict[str, Any]]]:
-    """The weights of a network in its training form that is the artifact's when deployed, and the runs that made them, oldest first.
+def run_of_artifact(artifact: Path) -> dict[str, Any]:
+    """What a checkpoint would say that the artifact could have been exported from, as far as another run can build on it.
 
-    Raises ModelError for an artifact that holds no network's float32 weights. What chance there is in the weights is torch's.
+    `network` is a training form that deploys to the artifact's weights; what chance there is in it is torch's. `before` are the runs that
+    made it, oldest first, and `preset` its network's. Raises ModelError for an artifact that holds no network's float32 weights.
     """
-    deployed = network_of_artifact(artifact)
-    card = load_session(artifact, "cpu", 1)[1].card
+    spec = load_session(artifact, "cpu", 1)[1]
+    if spec.precision == "int8":
+        raise ModelError(f"{artifact} has rounded weights: begin with the float32 artifact that it was made from")
+    card, deployed = spec.card, network_of_artifact(artifact)
     network = described_network(card["network"])
     network.load_deployed(deployed)
     runs = [*card.get("before", ()), {name: card[name] for name in RUN if name in card}]
-    return network.state_dict(), [run for run in runs if run.keys() == set(RUN)]
+    return {
+        "network": network.state_dict(),
+        "before": [run for run in runs if run.keys() == set(RUN)],
+        "preset": preset_of(card["network"]),
+    }

@@ -20,6 +20,14 @@ def network_of_preset(preset: str, scale: int) -> Network:
     return described_network({"architecture": preset, "scale": scale} if preset in PEERS else {"scale": scale, **PRESETS[preset]})
 
 
+def preset_of(description: dict[str, Any]) -> str | None:
+    """The preset that a network's own `description` is of, at whatever scale; None where it is of none."""
+    for preset in NAMES:
+        if network_of_preset(preset, 2).description == {**described_network(description).description, "scale": 2}:
+            return preset
+    return None
+
+
 def described_network(description: dict[str, Any]) -> Network:
     """An untrained network from its own `description`; raises ModelError for one of another version's, or none at all."""
     try:

@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 from tqdm import tqdm
 
 from client.errors import InputError, ModelError
-from model.artifact_weights import trainable_weights
+from model.artifact_weights import run_of_artifact
 from model.catalogue import NAMES, described_network, network_of_preset
 from model.footage import Degradation, FootageCache, Pair, by_game, load_pairs, load_scenes, sample_clips
 from model.losses import LOSSES, charbonnier, mean_log_mse
@@ -126,15 +127,17 @@ class Trainer:
     def _start_from(self, path: Path) -> None:
         """Take over every weight of the same name and shape; a network of another scale keeps its own head and base."""
         if path.suffix == ".onnx":
-            weights, self.before = trainable_weights(path)
+            earlier = run_of_artifact(path)
+            preset, self.before = earlier["preset"], earlier["before"]
         else:
             earlier = load_checkpoint(path)
-            weights = earlier["network"]
+            preset = earlier["config"]["preset"]
             self.before = [*earlier["before"], {"config": earlier["config"], "step": earlier["step"], "seconds": earlier["seconds"]}]
         own = self.network.state_dict()
-        fitting = {name: value for name, value in weights.items() if name in own and own[name].shape == value.shape}
-        if not fitting:
-            raise ModelError(f"{path} has no weight that fits this network")
+        fitting = {name: value for name, value in earlier["network"].items() if name in own and own[name].shape == value.shape}
+        first = next(name for name, layer in self.network.named_modules() if isinstance(layer, nn.Conv2d))
+        if f"{first}.weight" not in fitting:  # a layer inside fits many a network
+            raise ModelError(f"{path} has no weight that fits this network: it is one of --preset {preset}")
         self.network.load_state_dict({**own, **fitting})
 
     def save(self) -> None:

@@ -10,7 +10,7 @@ import torch
 from client.errors import GamesrError, ModelError
 from client.models import find_model
 from client.upscaler import OnnxUpscaler
-from model.artifact_weights import network_of_artifact, trainable_weights
+from model.artifact_weights import network_of_artifact, run_of_artifact
 from model.catalogue import network_of_preset
 from model.complexity import parameter_count
 from model.export import export_baseline, export_network
@@ -34,11 +34,11 @@ def test_the_training_form_gives_what_the_artifact_gives(preset: str, scale: int
     path = tmp_path / "network.onnx"
     network = random_network(preset, scale)
     export_network(network, path, name=preset, card={})
-    weights, before = trainable_weights(path)
-    assert before == []
+    run = run_of_artifact(path)
+    assert (run["preset"], run["before"]) == (preset, [])
     again = network_of_preset(preset, scale)
     assert parameter_count(again) == parameter_count(network)
-    again.load_state_dict(weights)
+    again.load_state_dict(run["network"])
     clip = random_clip(1, 3, 24, 40)
     expected, _ = network_of_artifact(path)(clip)
     for form in (again.double(), again.deployed()):
@@ -59,7 +59,7 @@ def test_a_run_goes_on_from_an_artifact_that_ships(name: str, footage: Path, tmp
     card = OnnxUpscaler(artifact, threads=1).spec.card
     assert [run["command"] for run in trainer.before] == [*(run["command"] for run in card["before"]), card["command"]]
     began = network_of_preset(preset, 2)
-    began.load_state_dict(trainable_weights(artifact)[0])
+    began.load_state_dict(run_of_artifact(artifact)["network"])
     moved = [not torch.equal(now, described) for now, described in zip(trainer.network.parameters(), began.parameters(), strict=True)]
     assert all(moved)
 
@@ -68,8 +68,7 @@ def test_blocks_that_the_artifact_does_not_have_begin_as_nothing(footage: Path, 
     artifact = find_model("live", 2)
     config = TrainConfig(**{**TINY.__dict__, "preset": "balanced", "initial_weights": str(artifact)})
     deeper = Trainer(config, footage, FootageCache(tmp_path / "cache"), tmp_path / "run").network
-    weights, _ = trainable_weights(artifact)
-    assert torch.equal(deeper.head.weight, weights["head.weight"])
+    assert torch.equal(deeper.head.weight, run_of_artifact(artifact)["network"]["head.weight"])
     assert [bool(block.conv.compress.weight.any()) for block in deeper.blocks] == [True, True, False, False, False, False]
 
 
@@ -78,13 +77,14 @@ def test_an_artifact_without_weights_to_train_is_refused(footage: Path, tmp_path
     (tmp_path / "foreign.onnx").write_bytes(b"no model at all")
     for path, message in (
         (tmp_path / "bicubic.onnx", "is no network"),
-        (find_model("live-int8", 2), "has rounded weights"),
+        (find_model("live-int8", 2), "has rounded weights: begin with the float32 artifact"),
         (tmp_path / "foreign.onnx", "foreign.onnx"),
         (tmp_path / "missing.onnx", "missing.onnx"),
     ):
         config = TrainConfig(**{**TINY.__dict__, "initial_weights": str(path)})
         with pytest.raises(GamesrError, match=message):
             Trainer(config, footage, FootageCache(tmp_path / "cache"), tmp_path / "run")
-    config = TrainConfig(**{**TINY.__dict__, "preset": "fsrcnn", "initial_weights": str(find_model("live", 2))})
-    with pytest.raises(ModelError, match="no weight that fits"):
-        Trainer(config, footage, FootageCache(tmp_path / "cache"), tmp_path / "run")
+    for preset in ("fsrcnn", "planes"):
+        config = TrainConfig(**{**TINY.__dict__, "preset": preset, "initial_weights": str(find_model("live", 2))})
+        with pytest.raises(ModelError, match="no weight that fits this network: it is one of --preset live"):
+            Trainer(config, footage, FootageCache(tmp_path / "cache"), tmp_path / "run")

@@ -22,6 +22,7 @@ from tests.networks import random_clip, random_network
         ("planes-plain", 2, 288_472, 129_112),
         ("planes", 2, 288_472 + 1_700, 129_112 + 1_700),  # and the learned kernels under the residual
         ("planes", 3, 297_142 + 3_825, 137_782 + 3_825),
+        ("planes-static", 2, 288_472 + 1_700, 129_112 + 1_700),  # a norm's gain and offset are all of its parameters
     ],
 )
 def test_parameter_counts(preset: str, scale: int, training: int, fused: int) -> None:

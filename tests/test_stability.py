@@ -98,10 +98,11 @@ def test_a_shipped_model_passes_where_states_move_most() -> None:
     assert len(found) == 4 and all(outcome.passed for outcome in found.values()), found
 
 
+@pytest.mark.parametrize("name", ["gamesr", "quality"])
 @pytest.mark.parametrize("scale", [2, 3])
-def test_nothing_inside_a_shipped_network_comes_near_the_end_of_float16(scale: int) -> None:
+def test_nothing_inside_a_shipped_network_comes_near_the_end_of_float16(name: str, scale: int) -> None:
     """No input and no output of a layer is a tenth of it, nor is a cell; the largest are those of the base, in code values."""
-    network = network_of_artifact(find_model("gamesr", scale))
+    network = network_of_artifact(find_model(name, scale))
     largest: list[float] = []
 
     def look(_: torch.nn.Module, inputs: tuple[torch.Tensor, ...], output: torch.Tensor) -> None:
