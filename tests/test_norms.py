@@ -14,7 +14,7 @@ from openvino import opset13 as ops
 from client.models import shipped_models
 from client.norms import norms_in_place
 
-NORMS = {"gamesr": 5, "gamesr-paper": 5, "quality": 5}
+NORMS = {"gamesr": 5, "gamesr-paper": 5}
 
 
 def kinds(model: Any) -> list[str]:
