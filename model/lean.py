@@ -2,14 +2,14 @@
 
 Convolutions are the cheap part of a network on a CPU that multiplies matrices; passes over memory beside them are not. So what runs is a
 row of plain 3x3 convolutions and leaky ReLUs, all of one width: identities, the bicubic base and the cells that it needs are part of
-their weights.
+their weights. A network so narrow that the cells would be a third of its layers adds the base by convolutions of its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Literal, Self
+from typing import Literal, Self, cast
 
 import torch
 from torch import Tensor, nn
@@ -29,13 +29,15 @@ CELL = sum(block**2 for block in BLOCKS)  # samples of a cell
 class LeanConfig:
     """Everything that decides the network's shape.
 
-    `channels` is the width of what runs: features and the six samples of a cell. AMX computes 32 in one go, whatever part of them is used.
+    `channels` is the width of what runs: features and, where they are `carried`, the six samples of a cell. AMX computes 32 in one go,
+    AVX512 16, whatever part of them is used.
     """
 
     scale: Literal[2, 3] = 2
     channels: int = 32
     expanded: int = 64
     blocks: int = 2
+    carried: bool = True
 
     def __post_init__(self) -> None:
         if self.blocks < 0:
@@ -43,10 +45,10 @@ class LeanConfig:
 
     @property
     def features(self) -> int:
-        return self.channels - CELL
+        return self.channels - CELL * self.carried
 
 
-LEAN: dict[str, dict[str, int]] = {"live": {}, "balanced": {"blocks": 6}}
+LEAN: dict[str, dict[str, int]] = {"fast": {"channels": 16, "blocks": 1, "carried": False}, "live": {}, "balanced": {"blocks": 6}}
 
 
 class LeanBlock(nn.Module):
@@ -72,6 +74,17 @@ class LeanBlock(nn.Module):
         weight, bias = weight_and_bias(plain)
         weight[:, :, 1, 1] -= torch.eye(len(weight))
         self.conv.load_fused(convolution(weight, bias))
+
+
+class Head(nn.Module):
+    """What runs where no layer carries the cells: a convolution of the features and one of the cells, (N, C, h, w) each, added up."""
+
+    def __init__(self, features: nn.Conv2d, cells: nn.Conv2d) -> None:
+        super().__init__()
+        self.features, self.cells = features, cells
+
+    def forward(self, features: Tensor, cells: Tensor) -> Tensor:
+        return cast(Tensor, self.features(features) + self.cells(cells))
 
 
 class FlatInterpolation(LearnedInterpolation):
@@ -100,24 +113,26 @@ class Lean(Network):
         self.sides = [block * config.scale for block in BLOCKS]
         self.stem = nn.Conv2d(CELL, config.features, 3)
         self.blocks = nn.ModuleList(LeanBlock(config.features, config.expanded) for _ in range(config.blocks))
-        self.head = nn.Conv2d(config.features, sum(side**2 for side in self.sides), 3)
-        nn.init.zeros_(self.head.weight)
-        assert self.head.bias is not None
-        nn.init.zeros_(self.head.bias)
+        self.head: nn.Module = convolution(torch.zeros(sum(side**2 for side in self.sides), config.features, 3, 3), torch.zeros(0))
         self.luma_base = FlatInterpolation("bicubic", config.scale, BLOCKS[0], reach=1)
         self.chroma_base = FlatInterpolation("bicubic", config.scale, BLOCKS[1], chroma_shift(config.scale), reach=1)
-        self.carrying = False
+        self.running = False
 
     def step(
         self, frame: Planes, state: State | None, finish: Callable[[Tensor], Tensor] = lambda samples: samples
     ) -> tuple[Planes, State | None]:
         cells = self._cells(frame)
-        x = cells if self.carrying else INPUT_GAIN * (cells / 255 - 0.5)
+        x = cells if self.running else INPUT_GAIN * (cells / 255 - 0.5)
         x = F.leaky_relu(self.stem(x), LEAK)
         for block in self.blocks:
-            x = F.leaky_relu(block(x), LEAK) if self.carrying else block(x)
+            x = F.leaky_relu(block(x), LEAK) if self.running else block(x)
+        if self.running and not self.config.carried:
+            cells = cells[:, :, self.reach - 1 : 1 - self.reach, self.reach - 1 : 1 - self.reach]
+            luma = shuffle_channels_last(finish(self.head(x, cells)), self.sides[0])
+            chroma = shuffle_channels_last(finish(self.chroma_head(x, cells)), self.sides[1], 2)
+            return Planes(luma, *torch.split(chroma, 1, 1)), None
         x = self.head(x)
-        if not self.carrying:
+        if not self.running:
             with exact(x):
                 base = torch.cat((self.luma_base(frame.y), self.chroma_base(frame.u), self.chroma_base(frame.v)), 1)
                 x = base + 255 * RESIDUAL_GAIN * x.to(base.dtype)
@@ -125,21 +140,34 @@ class Lean(Network):
         return Planes(*(shuffle_channels_last(part, side) for part, side in zip(parts, self.sides, strict=True))), None
 
     def deployed(self) -> Self:
-        """Features and cells side by side in every layer, in place: codes are not negative, so the ReLUs let them through."""
+        """In place, the bases as convolutions of the cells, which are carried to them or stay apart.
+
+        Carried, cells lie beside the features in every layer: codes are not negative, so the ReLUs let them through. Apart, luma
+        and chroma have a head each, since taking apart what one gives takes as long as such a narrow convolution does.
+        """
         fuse(self.blocks)
         bases = block_diagonal([base.kernel().detach().double() for base in (self.luma_base, self.chroma_base, self.chroma_base)])
-        onward = torch.zeros_like(bases[:CELL])
-        onward[:, :, 1, 1] = torch.eye(CELL)
         weight, bias = weight_and_bias(self.stem)
-        stem = convolution(torch.cat((INPUT_GAIN / 255 * weight, onward)), bias - 0.5 * INPUT_GAIN * weight.sum((1, 2, 3)))
-        for index, block in enumerate(self.blocks):
-            weight, bias = weight_and_bias(block)
-            self.blocks[index] = convolution(block_diagonal([weight, onward]), bias).to(self.weight)
-        weight, bias = weight_and_bias(self.head)
-        head = convolution(torch.cat((255 * RESIDUAL_GAIN * weight, bases), 1), 255 * RESIDUAL_GAIN * bias)
-        self.stem, self.head = stem.to(self.weight), head.to(self.weight)
+        weight, bias = INPUT_GAIN / 255 * weight, bias - 0.5 * INPUT_GAIN * weight.sum((1, 2, 3))
+        head, head_bias = (255 * RESIDUAL_GAIN * part for part in weight_and_bias(self.head))
+        if self.config.carried:
+            onward = torch.zeros_like(bases[:CELL])
+            onward[:, :, 1, 1] = torch.eye(CELL)
+            weight = torch.cat((weight, onward))
+            for index, block in enumerate(self.blocks):
+                inner, inner_bias = weight_and_bias(block)
+                self.blocks[index] = convolution(block_diagonal([inner, onward]), inner_bias).to(self.weight)
+            self.head = convolution(torch.cat((head, bases), 1), head_bias).to(self.weight)
+        else:
+            none, luma = torch.zeros(0), self.sides[0] ** 2
+            heads = [
+                Head(convolution(head[part], head_bias[part]), convolution(bases[part], none)).to(self.weight)
+                for part in (slice(luma), slice(luma, None))
+            ]
+            self.head, self.chroma_head = heads
+        self.stem = convolution(weight, bias).to(self.weight)
         del self.luma_base, self.chroma_base
-        self.carrying = True
+        self.running = True
         return self
 
     def load_deployed(self, deployed: Self) -> None:
@@ -149,16 +177,26 @@ class Lean(Network):
         load_fused(self.stem, convolution(weight, bias[:features] + 0.5 * INPUT_GAIN * weight.sum((1, 2, 3))))
         plain = [weight_and_bias(block) for block in deployed.blocks]
         load_fused(self.blocks, nn.ModuleList(convolution(weight[:features, :features], bias[:features]) for weight, bias in plain))
-        weight, bias = weight_and_bias(deployed.head)
-        load_fused(self.head, convolution(weight[:, :features] / (255 * RESIDUAL_GAIN), bias / (255 * RESIDUAL_GAIN)))
+        if self.config.carried:
+            weight, bias = weight_and_bias(deployed.head)
+            weight, bases = weight[:, :features], weight[:, features:]
+        else:
+            heads = [cast(Head, head) for head in (deployed.head, deployed.chroma_head)]
+            weight, bias = (torch.cat(parts) for parts in zip(*(weight_and_bias(head.features) for head in heads), strict=True))
+            bases = torch.cat([weight_and_bias(head.cells)[0] for head in heads])
+        load_fused(self.head, convolution(weight / (255 * RESIDUAL_GAIN), bias / (255 * RESIDUAL_GAIN)))
         luma, chroma = self.sides[0] ** 2, self.sides[1] ** 2
-        self.luma_base.load_kernel(weight[:luma, features:-2])
-        self.chroma_base.load_kernel(weight[luma : luma + chroma, -2:-1])
+        self.luma_base.load_kernel(bases[:luma, :-2])
+        self.chroma_base.load_kernel(bases[luma : luma + chroma, -2:-1])
+
+    @property
+    def reach(self) -> int:
+        """How many cells away the layers see: the stem, the blocks and the head one each."""
+        return self.config.blocks + 2
 
     def _cells(self, frame: Planes) -> Tensor:
         """Cells (N, 6, H/2 + 2R, W/2 + 2R) of the planes, extended by the R cells that the layers reach."""
-        reach = self.config.blocks + 2
-        planes = [F.pad(plane, (reach * block,) * 4, mode="replicate") for plane, block in zip(frame, BLOCKS, strict=True)]
+        planes = [F.pad(plane, (self.reach * block,) * 4, mode="replicate") for plane, block in zip(frame, BLOCKS, strict=True)]
         return torch.cat([F.pixel_unshuffle(plane, block) for plane, block in zip(planes, BLOCKS, strict=True)], 1)
 
 
@@ -178,14 +216,15 @@ def weight_and_bias(conv: nn.Module) -> tuple[Tensor, Tensor]:
     return conv.weight.detach().double(), conv.bias.detach().double()
 
 
-def shuffle_channels_last(cells: Tensor, block: int) -> Tensor:
-    """PixelShuffle of one plane, (N, block^2, h, w) to (N, 1, block*h, block*w), by way of the layout that convolutions leave.
+def shuffle_channels_last(cells: Tensor, block: int, planes: int = 1) -> Tensor:
+    """PixelShuffle, (N, planes*block^2, h, w) to (N, planes, block*h, block*w), by way of the layout that convolutions leave.
 
     There it moves rows of `block` samples; OpenVINO's DepthToSpace takes twice as long.
     """
     n, _, h, w = cells.shape
-    rows = cells.permute(0, 2, 3, 1).reshape(n, h, w, block, block).permute(0, 1, 3, 2, 4)
-    return rows.reshape(n, 1, block * h, block * w)
+    rows = cells.permute(0, 2, 3, 1).reshape(n, h, w, *([planes] if planes > 1 else []), block, block)
+    order = (0, 3, 1, 4, 2, 5) if planes > 1 else (0, 1, 3, 2, 4)
+    return rows.permute(order).reshape(n, planes, block * h, block * w)
 
 
 def block_diagonal(kernels: list[Tensor]) -> Tensor:
