@@ -38,13 +38,15 @@ def even_channels(model: onnx.ModelProto, inputs: Iterable[Feeds]) -> None:
     `inputs`: in 8 bits with one step for a tensor those of small values have no use of most of its range.
     """
     convs = {node.output[0]: node for node in model.graph.node if node.op_type == "Conv"}
-    readers = {node.input[0]: node for node in convs.values()}
+    readers: dict[str, list[onnx.NodeProto]] = {}
+    for node in convs.values():
+        readers.setdefault(node.input[0], []).append(node)
     read = Counter(name for node in model.graph.node for name in node.input)
     joined = [
         (convs[node.input[0]], node.output[0], readers[node.output[0]])
         for node in model.graph.node
         if node.op_type == "LeakyRelu" and node.input[0] in convs and node.output[0] in readers
-        if read[node.input[0]] == read[node.output[0]] == 1  # nothing else sees the scale
+        if read[node.input[0]] == 1 and read[node.output[0]] == len(readers[node.output[0]])  # nothing else sees the scale
     ]
     names = [features for _, features, _ in joined]
     lowest: dict[str, Array] = dict.fromkeys(names, np.zeros(1))
@@ -55,12 +57,12 @@ def even_channels(model: onnx.ModelProto, inputs: Iterable[Feeds]) -> None:
             highest[name] = np.maximum(highest[name], features.max((0, 2, 3)))
     tensors = {tensor.name: tensor for tensor in model.graph.initializer}
     for before, name, behind in joined:
-        weight = numpy_helper.to_array(tensors[behind.input[1]])
-        reach = _even(lowest[name], highest[name], np.square(weight, dtype=np.float64).sum((0, 2, 3)))
+        weights = [numpy_helper.to_array(tensors[conv.input[1]]) for conv in behind]
+        reach = _even(lowest[name], highest[name], sum(np.square(weight, dtype=np.float64).sum((0, 2, 3)) for weight in weights))
         for tensor, factors in (
             (before.input[1], 1 / reach[:, None, None, None]),
             (before.input[2], 1 / reach),
-            (behind.input[1], reach[None, :, None, None]),
+            *((conv.input[1], reach[None, :, None, None]) for conv in behind),
         ):
             scaled = (numpy_helper.to_array(tensors[tensor]) * factors).astype(np.float32)
             tensors[tensor].CopyFrom(numpy_helper.from_array(scaled, tensor))

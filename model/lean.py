@@ -77,7 +77,10 @@ class LeanBlock(nn.Module):
 
 
 class Head(nn.Module):
-    """What runs where no layer carries the cells: a convolution of the features and one of the cells, (N, C, h, w) each, added up."""
+    """What runs where no layer carries the cells: a convolution of the features and one of the cells, (N, C, h, w) each, added up.
+
+    The bias is the second one's, which stays float in an int8 artifact.
+    """
 
     def __init__(self, features: nn.Conv2d, cells: nn.Conv2d) -> None:
         super().__init__()
@@ -159,9 +162,9 @@ class Lean(Network):
                 self.blocks[index] = convolution(block_diagonal([inner, onward]), inner_bias).to(self.weight)
             self.head = convolution(torch.cat((head, bases), 1), head_bias).to(self.weight)
         else:
-            none, luma = torch.zeros(0), self.sides[0] ** 2
+            luma = self.sides[0] ** 2
             heads = [
-                Head(convolution(head[part], head_bias[part]), convolution(bases[part], none)).to(self.weight)
+                Head(convolution(head[part], None), convolution(bases[part], head_bias[part])).to(self.weight)
                 for part in (slice(luma), slice(luma, None))
             ]
             self.head, self.chroma_head = heads
@@ -182,8 +185,8 @@ class Lean(Network):
             weight, bases = weight[:, :features], weight[:, features:]
         else:
             heads = [cast(Head, head) for head in (deployed.head, deployed.chroma_head)]
-            weight, bias = (torch.cat(parts) for parts in zip(*(weight_and_bias(head.features) for head in heads), strict=True))
-            bases = torch.cat([weight_and_bias(head.cells)[0] for head in heads])
+            weight = torch.cat([head.features.weight.detach().double() for head in heads])
+            bases, bias = (torch.cat(parts) for parts in zip(*(weight_and_bias(head.cells) for head in heads), strict=True))
         load_fused(self.head, convolution(weight / (255 * RESIDUAL_GAIN), bias / (255 * RESIDUAL_GAIN)))
         luma, chroma = self.sides[0] ** 2, self.sides[1] ** 2
         self.luma_base.load_kernel(bases[:luma, :-2])
@@ -200,13 +203,13 @@ class Lean(Network):
         return torch.cat([F.pixel_unshuffle(plane, block) for plane, block in zip(planes, BLOCKS, strict=True)], 1)
 
 
-def convolution(weight: Tensor, bias: Tensor) -> nn.Conv2d:
+def convolution(weight: Tensor, bias: Tensor | None) -> nn.Conv2d:
     """One with the given weights, in their dtype and without padding; outputs beyond the biases have none."""
-    conv = nn.Conv2d(weight.shape[1], weight.shape[0], 3, dtype=weight.dtype)
-    assert conv.bias is not None
+    conv = nn.Conv2d(weight.shape[1], weight.shape[0], 3, bias=bias is not None, dtype=weight.dtype)
     with torch.no_grad():
         conv.weight.copy_(weight)
-        conv.bias.zero_()[: len(bias)] = bias
+        if bias is not None and conv.bias is not None:
+            conv.bias.zero_()[: len(bias)] = bias
     return conv
 
 

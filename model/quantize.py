@@ -30,7 +30,8 @@ from model.lean import ARCHITECTURE, CELL
 
 # Not the gates, whose error the state would keep; not what interpolates, which makes the code values themselves; and not a head
 # whose base is apart: a residual of rare large values in 8 bits is what lost most, and such a head is a twentieth of the work.
-QUANTIZED = re.compile(r"network\.(stem|blocks\.\d+(\.conv)?|head\.features)\.weight")
+QUANTIZED = re.compile(r"network\.(stem|blocks\.\d+(\.conv)?|(chroma_)?head\.features)\.weight")
+HEAD_FEATURES = re.compile(r"network\.(chroma_)?head\.features\.weight")
 Made = tuple[Callable[[int, int, int], Iterator[Frame]], int, int]
 # Few clips have features as large as letters, one-pixel lines and stripes of any colours make them (noise two samples wide is
 # stripes, as the edges go on): cut off there, lines came out 36 codes wrong.
@@ -40,7 +41,6 @@ CALIBRATION_FRAMES = 8
 
 CODES, MIDDLE = "codes_about_zero", 128
 RESIDUAL = "residual"  # what the head makes of the features, in codes
-CELLS_BIAS = "network.head.cells.bias"  # what 8 bits take from the residual in the mean (Nagel et al. 2019, section 4.2)
 
 JOINING = ("Relu", "Add")
 
@@ -54,18 +54,18 @@ def quantize(
     the smallest and the largest value in the first `frames` frames of each, and in `MADE_FRAMES` frames of each of `MADE`. Weights
     are symmetric, a scale for each output channel, features unsigned with one scale and zero point for a tensor (signed ones take
     twice as long in both runtimes), of which every channel is made to use all (`even_channels`). What 8 bits do to the mean of the
-    clips' pictures is taken back where the layers carry the cells. Raises ModelError for an artifact that is not a float32 network of
+    clips' pictures is taken back in a `model.lean` network. Raises ModelError for an artifact that is not a float32 network of
     ours and InputError for a clip without frames.
     """
     _, spec = load_session(artifact, "cpu", 1)
     model = onnx.load(artifact)
     if spec.precision != "float32":
         raise ModelError(f"{artifact} is {spec.precision} already: quantize the float32 artifact")
-    split_carried_cells(model.graph, spec)
+    residuals = apart_from_cells(model.graph, spec)
     nodes = _quantized_nodes(model.graph)
     if not nodes:
         raise ModelError(f"{artifact} has no layer that is quantized: it is no GameSR network")
-    left_float = [RESIDUAL, *(node.input[0] for node in model.graph.node if node.op_type == "LeakyRelu")]
+    left_float = [*residuals, *(node.input[0] for node in model.graph.node if node.op_type == "LeakyRelu")]
     metadata = {entry.key: entry.value for entry in model.metadata_props}
     footage = _Footage(spec, clips, frames, MADE)
     even_channels(model, footage)
@@ -86,9 +86,10 @@ def quantize(
         quantized = onnx.load(whole)
     for tensor in left_float:
         leave_float(quantized.graph, tensor)
-    if bias := next((tensor for tensor in quantized.graph.initializer if tensor.name == CELLS_BIAS), None):
-        lost = mean_difference(model, quantized, RESIDUAL, _Footage(spec, clips, frames))
-        bias.CopyFrom(numpy_helper.from_array(lost.astype(np.float32), CELLS_BIAS))
+    for residual, bias in residuals.items():
+        lost = mean_difference(model, quantized, residual, _Footage(spec, clips, frames))
+        tensor = next(tensor for tensor in quantized.graph.initializer if tensor.name == bias)
+        tensor.CopyFrom(numpy_helper.from_array((numpy_helper.to_array(tensor) + lost).astype(np.float32), bias))
     card = {**spec.card, "quantized_from": spec.sha256, "calibration": footage.played}
     helper.set_model_props(quantized, {**metadata, "name": name, "precision": "int8", "card": json.dumps(card)})
     onnx.checker.check_model(quantized, full_check=True)
@@ -152,13 +153,32 @@ def _quantized_nodes(graph: onnx.GraphProto) -> list[str]:
     return nodes
 
 
-def split_carried_cells(graph: onnx.GraphProto, spec: ModelSpec) -> None:
-    """Take the picture's cells out of the layers of a `model.lean` network, in place: 8 bits do for features, not for codes beside them.
+def apart_from_cells(graph: onnx.GraphProto, spec: ModelSpec) -> dict[str, str]:
+    """Keep the picture's cells out of the layers of a `model.lean` network, in place: 8 bits do for features, not for codes beside them.
 
-    The head becomes one of features and one of cells, cut to what the layers would have left of them. Any other network stays as it is.
+    The stem is given codes about zero. Returns the tensors that heads make of the features, in codes, and for each the bias that can give
+    back what 8 bits take from it in the mean (Nagel et al. 2019, section 4.2). Any other network stays as it is, and has none.
     """
-    if spec.card.get("network", {}).get("architecture") != ARCHITECTURE:
-        return
+    described = spec.card.get("network", {})
+    if described.get("architecture") != ARCHITECTURE:
+        return {}
+    if described.get("carried", True):
+        _split_carried_cells(graph)
+    tensors = {tensor.name: tensor for tensor in graph.initializer}
+    stem = next(node for node in graph.node if node.op_type == "Conv")
+    # About zero, what 8 bits do to a weight counts for detail alone, not for how bright a picture is.
+    bias = tensors[stem.input[2]]
+    gain = numpy_helper.to_array(tensors[stem.input[1]]).sum((1, 2, 3), dtype=np.float64)
+    bias.CopyFrom(numpy_helper.from_array((numpy_helper.to_array(bias) + MIDDLE * gain).astype(np.float32), bias.name))
+    graph.initializer.append(numpy_helper.from_array(np.array(MIDDLE, np.float32), "middle"))
+    graph.node.insert(list(graph.node).index(stem), helper.make_node("Sub", [stem.input[0], "middle"], [CODES], name=CODES))
+    stem.input[0] = CODES
+    heads = [node for node in graph.node if node.op_type == "Conv" and HEAD_FEATURES.fullmatch(node.input[1])]
+    return {head.output[0]: head.input[1].replace("features.weight", "cells.bias") for head in heads}
+
+
+def _split_carried_cells(graph: onnx.GraphProto) -> None:
+    """Make two of a head that reads features and cells: one of the features, one of the cells, cut to what the layers would have left."""
     tensors = {tensor.name: tensor for tensor in graph.initializer}
     stem, *blocks, head = (node for node in graph.node if node.op_type == "Conv")
     features = numpy_helper.to_array(tensors[stem.input[1]]).shape[0] - CELL
@@ -166,17 +186,12 @@ def split_carried_cells(graph: onnx.GraphProto, spec: ModelSpec) -> None:
         inputs = CELL if conv is stem else features
         for name, part in ((conv.input[1], np.s_[:features, :inputs]), (conv.input[2], np.s_[:features])):
             tensors[name].CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensors[name])[part].copy(), name))
-    # Codes about zero: what 8 bits do to a weight then counts for detail alone, not for how bright a picture is.
-    bias = tensors[stem.input[2]]
-    gain = numpy_helper.to_array(tensors[stem.input[1]]).sum((1, 2, 3), dtype=np.float64)
-    bias.CopyFrom(numpy_helper.from_array((numpy_helper.to_array(bias) + MIDDLE * gain).astype(np.float32), bias.name))
     weight = numpy_helper.to_array(tensors[head.input[1]])
     cut = 1 + len(blocks)
     new = {
         "network.head.features.weight": weight[:, :features],
         "network.head.cells.weight": weight[:, features:],
-        CELLS_BIAS: np.zeros(len(weight), np.float32),
-        "middle": np.array(MIDDLE, np.float32),
+        "network.head.cells.bias": np.zeros(len(weight), np.float32),
         "starts": np.array([cut, cut]),
         "ends": np.array([-cut, -cut]),
         "axes": np.array([2, 3]),
@@ -184,17 +199,15 @@ def split_carried_cells(graph: onnx.GraphProto, spec: ModelSpec) -> None:
     graph.initializer.extend(numpy_helper.from_array(array.copy(), name) for name, array in new.items())
     graph.initializer.remove(tensors[head.input[1]])
     cells, source = stem.input[0], head.input[0]
-    stem.input[0] = CODES
-    before = {stem.name: [helper.make_node("Sub", [cells, "middle"], [CODES], name=CODES), stem]}
-    instead = {
-        head.name: [
-            helper.make_node("Conv", [source, "network.head.features.weight", head.input[2]], [RESIDUAL], name=RESIDUAL),
-            helper.make_node("Slice", [cells, "starts", "ends", "axes"], ["head_source"], name="head_source"),
-            helper.make_node("Conv", ["head_source", "network.head.cells.weight", CELLS_BIAS], ["head_cells"], name="head_cells"),
-            helper.make_node("Add", [RESIDUAL, "head_cells"], list(head.output), name="head"),
-        ]
-    }
-    nodes = [part for node in graph.node for part in {**before, **instead}.get(node.name, [node])]
+    instead = [
+        helper.make_node("Conv", [source, "network.head.features.weight", head.input[2]], [RESIDUAL], name=RESIDUAL),
+        helper.make_node("Slice", [cells, "starts", "ends", "axes"], ["head_source"], name="head_source"),
+        helper.make_node(
+            "Conv", ["head_source", "network.head.cells.weight", "network.head.cells.bias"], ["head_cells"], name="head_cells"
+        ),
+        helper.make_node("Add", [RESIDUAL, "head_cells"], list(head.output), name="head"),
+    ]
+    nodes = [part for node in graph.node for part in (instead if node.name == head.name else [node])]
     del graph.node[:]
     graph.node.extend(nodes)
     del graph.value_info[:]  # whose shapes are those of the wider layers

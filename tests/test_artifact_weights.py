@@ -28,7 +28,8 @@ def footage(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("preset", "scale"), [("planes", 2), ("planes-static", 3), ("paper", 2), ("live", 3), ("balanced", 2), ("srvgg", 2), ("imdn", 3)]
+    ("preset", "scale"),
+    [("planes", 2), ("planes-static", 3), ("paper", 2), ("fast", 2), ("fast", 3), ("live", 3), ("balanced", 2), ("srvgg", 2), ("imdn", 3)],
 )
 def test_the_training_form_gives_what_the_artifact_gives(preset: str, scale: int, tmp_path: Path) -> None:
     path = tmp_path / "network.onnx"

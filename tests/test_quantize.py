@@ -21,13 +21,14 @@ from model.export import export_baseline, export_network
 from model.lean import Lean, LeanConfig
 from model.network import GameSR, NetworkConfig
 from model.planes import Network
-from model.quantize import CODES, RESIDUAL, quantize, split_carried_cells
+from model.quantize import CODES, apart_from_cells, quantize
 from model.quantize_cli import main
 from model.trial import BOUNDS
 from tests.moving import picture, write_footage
 
-NETWORKS: dict[str, Callable[[], Network]] = {  # one without a state whose layers carry the cells, and one with a state whose base is apart
+NETWORKS: dict[str, Callable[[], Network]] = {  # without a state, the cells in its layers or beside them; and with one, the base apart
     "carrying": lambda: Lean(LeanConfig(channels=14, expanded=8, blocks=2)),
+    "apart": lambda: Lean(LeanConfig(channels=8, expanded=8, blocks=2, carried=False)),
     "recurrent": lambda: GameSR(NetworkConfig(channels=8, expanded=8, blocks=1, learned_base=True, skip=True)),
 }
 
@@ -88,12 +89,15 @@ def test_int8_comes_near_the_float32_artifact(folder: Path, name: str, provider:
         assert 0 < np.square(rounded - exact).mean() < 0.01 * np.square(exact - nothing).mean(), plane
 
 
-def test_codes_keep_their_numbers_and_what_is_added_to_the_interpolation_stays_float(folder: Path) -> None:
-    graph = onnx.load(folder / "carrying-int8.onnx").graph
+@pytest.mark.parametrize(("name", "heads"), [("carrying", 1), ("apart", 2)])
+def test_codes_keep_their_numbers_and_what_is_added_to_the_interpolation_stays_float(folder: Path, name: str, heads: int) -> None:
+    exact = onnx.load(folder / f"{name}.onnx")
+    residuals = apart_from_cells(exact.graph, OnnxUpscaler(folder / f"{name}.onnx", threads=1).spec)
+    graph = onnx.load(folder / f"{name}-int8.onnx").graph
     tensors = {t.name: numpy_helper.to_array(t) for t in graph.initializer}
     (codes_down,) = (node for node in graph.node if node.op_type == "QuantizeLinear" and node.input[0] == CODES)
     assert (tensors[codes_down.input[1]], tensors[codes_down.input[2]]) == (1, 128)
-    assert [node.op_type for node in graph.node if RESIDUAL in node.input] == ["Add"]
+    assert [[node.op_type for node in graph.node if residual in node.input] for residual in residuals] == [["Add"]] * heads
     source = {node.output[0]: node.op_type for node in graph.node}
     assert {source[node.input[0]] for node in graph.node if node.op_type == "LeakyRelu"} == {"Conv"}
     assert not {name for name in tensors if name.endswith(("_scale", "_zero_point"))} - {name for n in graph.node for name in n.input}
@@ -116,6 +120,9 @@ def test_weights_are_symmetric_per_channel_and_what_must_stay_float_does(folder:
         int8_weights.add(source[conv.input[1]].input[0].removeprefix("network.").removesuffix(".weight_quantized"))
     if name == "carrying":
         assert int8_weights == {"stem", "blocks.0", "blocks.1", "head.features"} and float_weights == {"head.cells"}
+    elif name == "apart":
+        assert int8_weights == {"stem", "blocks.0", "blocks.1", "head.features", "chroma_head.features"}
+        assert float_weights == {"head.cells", "chroma_head.cells"}
     else:
         assert int8_weights == {"stem", "blocks.0.conv"}
         assert float_weights == {"lstm.gates", "head", "luma_base", "chroma_base"}
@@ -142,21 +149,26 @@ def test_it_is_the_same_model_to_the_client_but_for_its_precision(folder: Path, 
     assert ours.card == {**theirs.card, "quantized_from": theirs.sha256, "calibration": ["clip.mkv (6 frames)", *made]}
 
 
-def test_without_the_cells_in_its_layers_it_is_the_same_network(folder: Path, tmp_path: Path) -> None:
-    model = onnx.load(folder / "carrying.onnx")
-    split_carried_cells(model.graph, OnnxUpscaler(folder / "carrying.onnx", threads=1).spec)
+@pytest.mark.parametrize("name", ["carrying", "apart"])
+def test_without_the_cells_in_its_layers_it_is_the_same_network(folder: Path, tmp_path: Path, name: str) -> None:
+    model = onnx.load(folder / f"{name}.onnx")
+    apart_from_cells(model.graph, OnnxUpscaler(folder / f"{name}.onnx", threads=1).spec)
     onnx.save(model, tmp_path / "split.onnx")
     frames = list(hard_cases.noise(48, 32, 4))
-    error = codes(tmp_path / "split.onnx", frames) - codes(folder / "carrying.onnx", frames)
+    error = codes(tmp_path / "split.onnx", frames) - codes(folder / f"{name}.onnx", frames)
     assert np.abs(error).max() <= 1 and np.count_nonzero(error) < 1e-3 * error.size
+
+
+def test_a_network_that_carries_no_cells_stays_as_it_is(folder: Path) -> None:
     apart = onnx.load(folder / "recurrent.onnx")
-    split_carried_cells(apart.graph, OnnxUpscaler(folder / "recurrent.onnx", threads=1).spec)
+    assert apart_from_cells(apart.graph, OnnxUpscaler(folder / "recurrent.onnx", threads=1).spec) == {}
     assert apart == onnx.load(folder / "recurrent.onnx")
 
 
-def test_channels_made_even_leave_the_network_as_it_is_and_reach_as_far_as_each_other(folder: Path, tmp_path: Path) -> None:
-    before = onnx.load(folder / "carrying.onnx")
-    split_carried_cells(before.graph, OnnxUpscaler(folder / "carrying.onnx", threads=1).spec)
+@pytest.mark.parametrize("network", ["carrying", "apart"])
+def test_channels_made_even_leave_the_network_as_it_is_and_reach_as_far_as_each_other(folder: Path, tmp_path: Path, network: str) -> None:
+    before = onnx.load(folder / f"{network}.onnx")
+    residuals = apart_from_cells(before.graph, OnnxUpscaler(folder / f"{network}.onnx", threads=1).spec)
     even = onnx.load_from_string(before.SerializeToString())
     feeds = [planes(frame) for frame in hard_cases.noise(48, 32, 3)]
     even_channels(even, feeds)
@@ -168,16 +180,17 @@ def test_channels_made_even_leave_the_network_as_it_is_and_reach_as_far_as_each_
         np.testing.assert_allclose(np.maximum(high, low * high.max() / low.min()), high.max(), rtol=1e-5)
         spread = np.stack([channel_max(seen[name]) for seen in observed(before, [name], feeds)]).max(0)
         assert spread.max() > 1.2 * spread.min()  # they were not so before
-    np.testing.assert_allclose(mean_difference(even, before, RESIDUAL, feeds), 0, atol=1e-4)
+    for residual in residuals:
+        np.testing.assert_allclose(mean_difference(even, before, residual, feeds), 0, atol=1e-4)
     onnx.save(even, tmp_path / "even.onnx")
     frames = list(hard_cases.noise(48, 32, 4))
-    error = codes(tmp_path / "even.onnx", frames) - codes(folder / "carrying.onnx", frames)
+    error = codes(tmp_path / "even.onnx", frames) - codes(folder / f"{network}.onnx", frames)
     assert np.abs(error).max() <= 1 and np.count_nonzero(error) < 1e-3 * error.size
 
 
 def test_channels_that_something_else_reads_are_left_and_dead_ones_stay_finite(folder: Path) -> None:
     model = onnx.load(folder / "carrying.onnx")
-    split_carried_cells(model.graph, OnnxUpscaler(folder / "carrying.onnx", threads=1).spec)
+    apart_from_cells(model.graph, OnnxUpscaler(folder / "carrying.onnx", threads=1).spec)
     tensors = {t.name: t for t in model.graph.initializer}
     for name in ("network.blocks.0.weight", "network.blocks.0.bias"):
         tensors[name].CopyFrom(numpy_helper.from_array(0 * numpy_helper.to_array(tensors[name]), name))
@@ -193,13 +206,13 @@ def test_channels_that_something_else_reads_are_left_and_dead_ones_stay_finite(f
 
 def test_the_mean_difference_is_that_of_each_channel(folder: Path) -> None:
     model = onnx.load(folder / "carrying.onnx")
-    split_carried_cells(model.graph, OnnxUpscaler(folder / "carrying.onnx", threads=1).spec)
+    apart_from_cells(model.graph, OnnxUpscaler(folder / "carrying.onnx", threads=1).spec)
     other = onnx.load_from_string(model.SerializeToString())
     bias = next(t for t in other.graph.initializer if t.name == "network.head.bias")
     shift = np.arange(24, dtype=np.float32)
     bias.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(bias) - shift, bias.name))
     feeds = [planes(frame) for size in (48, 64) for frame in hard_cases.noise(size, 32, 2)]
-    np.testing.assert_allclose(mean_difference(model, other, RESIDUAL, feeds), shift, atol=1e-3)
+    np.testing.assert_allclose(mean_difference(model, other, "residual", feeds), shift, atol=1e-3)
 
 
 @pytest.mark.parametrize("case", ["lines", "text", "noise"])
