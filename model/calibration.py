@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 import onnx
@@ -11,8 +11,16 @@ import onnxruntime
 from numpy.typing import NDArray
 from onnx import numpy_helper
 
+from client.frames import Frame
+from model.hard_cases import lines, noise, text
+
 SMALLEST = 0.01  # of the largest channel: what is nearly dead is not blown up any further
 RATIOS = np.geomspace(0.05, 1, 30)  # of the negative end of a range to its positive one
+Made = tuple[Callable[[int, int, int], Iterator[Frame]], int, int]
+# Few clips have features as large as letters, one-pixel lines and stripes of any colours make them (noise two samples wide is
+# stripes, as the edges go on): cut off there, lines came out 36 codes wrong.
+MADE: tuple[Made, ...] = ((lines, 160, 96), (text, 160, 96), (noise, 160, 96), (noise, 160, 2), (noise, 2, 96))
+MADE_FRAMES = 16
 
 Array = NDArray[np.float64]
 Feeds = dict[str, NDArray[np.generic]]  # what a graph takes, by name

@@ -7,7 +7,7 @@ import json
 import logging
 import re
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
@@ -24,19 +24,13 @@ from client.frames import Frame
 from client.upscaler import copy_padded, plane_shapes
 from client.video import read_frames
 from model.artifact_files import Page, write_artifact
-from model.calibration import Feeds, even_channels, mean_difference
-from model.hard_cases import lines, noise, text
+from model.calibration import MADE, MADE_FRAMES, Feeds, Made, even_channels, mean_difference
 from model.lean import ARCHITECTURE, CELL
 
 # Not the gates, whose error the state would keep; not what interpolates, which makes the code values themselves; and not a head
 # whose base is apart: a residual of rare large values in 8 bits is what lost most, and such a head is a twentieth of the work.
 QUANTIZED = re.compile(r"network\.(stem|blocks\.\d+(\.conv)?|(chroma_)?head\.features)\.weight")
 HEAD_FEATURES = re.compile(r"network\.(chroma_)?head\.features\.weight")
-Made = tuple[Callable[[int, int, int], Iterator[Frame]], int, int]
-# Few clips have features as large as letters, one-pixel lines and stripes of any colours make them (noise two samples wide is
-# stripes, as the edges go on): cut off there, lines came out 36 codes wrong.
-MADE: tuple[Made, ...] = ((lines, 160, 96), (text, 160, 96), (noise, 160, 96), (noise, 160, 2), (noise, 2, 96))
-MADE_FRAMES = 16
 CALIBRATION_FRAMES = 8
 
 CODES, MIDDLE = "codes_about_zero", 128

@@ -7,6 +7,7 @@ import os
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
@@ -23,6 +24,7 @@ from model.catalogue import NAMES, described_network, network_of_preset
 from model.footage import Degradation, FootageCache, Pair, by_game, load_pairs, load_scenes, sample_clips
 from model.losses import LOSSES, charbonnier, mean_log_mse
 from model.planes import Network, Planes, State
+from model.rounding import RoundedFeatures
 
 CHECKPOINT_FORMAT = 1
 
@@ -56,6 +58,7 @@ class TrainConfig:
     seed: int = 0
     bfloat16: bool = False
     initial_weights: str = ""
+    int8: bool = False
 
     def __post_init__(self) -> None:
         if self.preset not in NAMES:
@@ -103,6 +106,7 @@ class Trainer:
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), config.learning_rate, betas=(0.9, 0.999), weight_decay=config.weight_decay
         )
+        self.rounded = RoundedFeatures(self.network) if config.int8 else None
         self.forward: Any = torch.compile(self.network) if compiled else self.network
         self.footage = {
             split: [f"{pair.title.split()[0]} ({len(pair)} frames)" for pair in (takes[0] for takes in pairs)]
@@ -186,7 +190,8 @@ class Trainer:
     def _update(self, low: Planes, high: Planes, state: State | None) -> tuple[float, State | None]:
         for group in self.optimizer.param_groups:
             group["lr"] = self.config.rate_at(self.step)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.bfloat16):
+        rounding = self.rounded(self.step) if self.rounded else nullcontext()
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.bfloat16), rounding:
             output, state = self.forward(low, state)
         loss = mean_log_mse(output, high) if self.config.loss == "psnr" else charbonnier(output, high, self.config.charbonnier_eps)
         self.optimizer.zero_grad()

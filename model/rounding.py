@@ -1,0 +1,58 @@
+"""Training for 8 bits: what rounding the features that a head reads does to the picture is part of the error that is minimized."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor, nn
+
+from client.errors import InputError
+from client.frames import Frame
+from model.calibration import MADE, MADE_FRAMES
+from model.lean import Lean
+from model.planes import Network, Planes
+
+STEPS = 255  # from the smallest to the largest value of a channel
+
+
+class RoundedFeatures:
+    """Noise as wide as a step of 8 bits on what the last block of a `model.lean` network gives, while it is trained.
+
+    A channel's step follows from its range over the clip and over the made frames that calibration looks at too, and so does
+    its gradient: a network comes to give letters, lines and noise no larger features than footage. That is the noise of DiffQ
+    (Defossez et al. 2021) on features, whose range it leaves to be learned. Raises InputError for any other network.
+    """
+
+    def __init__(self, network: Network) -> None:
+        if not isinstance(network, Lean) or not network.blocks:
+            raise InputError("only fast, live and balanced can be trained for 8 bits")
+        self._network, self._last = network, network.blocks[-1]
+        made = [[_planes(frame, network.weight.device) for frame in make(width, height, MADE_FRAMES)] for make, width, height in MADE]
+        self._made = list(zip(*made, strict=True))
+
+    @contextmanager
+    def __call__(self, index: int) -> Iterator[None]:
+        """While clips go through the network; `index` says which of the made frames tell the ranges."""
+        seen: list[Tensor] = []
+        hook = self._last.register_forward_hook(lambda module, inputs, features: seen.append(features))
+        for frame in self._made[index % MADE_FRAMES]:
+            self._network.step(frame, None)
+        hook.remove()
+        highest = torch.stack([features.amax((0, 2, 3)) for features in seen]).amax(0)
+        lowest = torch.stack([features.amin((0, 2, 3)) for features in seen]).amin(0)
+
+        def rounded(module: nn.Module, inputs: object, features: Tensor) -> Tensor:
+            width = torch.maximum(highest, features.amax((0, 2, 3))) - torch.minimum(lowest, features.amin((0, 2, 3)))
+            return features + (torch.rand_like(features) - 0.5) * (width / STEPS)[:, None, None]
+
+        hook = self._last.register_forward_hook(rounded)
+        try:
+            yield
+        finally:
+            hook.remove()
+
+
+def _planes(frame: Frame, device: torch.device) -> Planes:
+    return Planes(*(torch.from_numpy(plane).to(device, torch.float32)[None, None] for plane in (frame.y, frame.u, frame.v)))
