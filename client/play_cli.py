@@ -39,7 +39,7 @@ examples:
       listens for gamesr-stream, or any RTP sender of H.264, and shows it in a window; F1 says how it goes, W wipes against bicubic
   gamesr-play sender.sdp --fullscreen --provider openvino-bfloat16
       the same by a session description
-  gamesr-play :5004 --provider openvino --tiers balanced-int8,live-int8,fast,bicubic
+  gamesr-play :5004 --provider openvino --tiers balanced-int8,live-int8,fast-int8,bicubic
       on a processor without AMX, where 8 bits are the fast ones
   gamesr-play :5004 --sink null --seconds 60 --json
       measures: nothing is shown, one JSON object says what would have been

@@ -40,6 +40,7 @@ folder and goes on where it stopped when the same command is given again:
   gamesr-train footage.toml runs/openarena_x2 --games openarena --steps 20000
   gamesr-train footage.toml runs/paper_x3 --preset paper --scale 3 --device cuda
   gamesr-train my_game.toml runs/my_live_x2 --preset live --initial-weights client/weights/live_x2.onnx --learning-rate 0.0003
+  gamesr-train my_game.toml runs/my_fast_x2 --preset fast --initial-weights client/weights/fast_x2.onnx --learning-rate 0.0003 --int8
 """
 
 VERIFY_EXAMPLES = """\

@@ -24,8 +24,8 @@ from model.verify import crop, parity
 
 REFERENCE = Path(__file__).parent / "footage" / "oa_koth1_1080p.mp4"
 UNTRAINED, NETWORKS = ("bicubic", "lanczos", "easu", "fsr1"), ("gamesr", "gamesr-paper", "quality", "balanced", "live", "fast")
-IN_INT8 = ("balanced", "live")
-TIERS = ("fast", "live", "balanced", "quality", "gamesr", "live-int8")
+IN_INT8 = ("balanced", "live", "fast")
+TIERS = ("fast", "live", "balanced", "quality", "gamesr", "fast-int8", "live-int8")
 STEPS = {"noise": 6, "still": 40, "sizes": 2}
 NEEDS_BFLOAT16 = pytest.mark.skipif(
     "BF16" not in openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES"), reason="this processor does not compute in bfloat16"
