@@ -169,6 +169,16 @@ def _name_slopes(module: nn.Module, graph: onnx.GraphProto) -> None:
         graph.initializer.remove(tensor)
 
 
+def _keep_biases(module: nn.Module, graph: onnx.GraphProto) -> None:
+    """Give convolutions back the biases that the exporter leaves out for being zero, as in a head that has learned nothing yet."""
+    biases = {f"{name}.weight": part.bias for name, part in module.named_modules() if isinstance(part, nn.Conv2d)}
+    for node in graph.node:
+        bias = biases.get(node.input[1]) if node.op_type == "Conv" and len(node.input) == 2 else None
+        if bias is not None:
+            node.input.append(node.input[1].removesuffix("weight") + "bias")
+            graph.initializer.append(onnx.numpy_helper.from_array(bias.detach().numpy(), node.input[2]))
+
+
 def _traced(module: nn.Module, state: State | None, divisor: int, metadata: dict[str, Any]) -> onnx.ModelProto:
     chroma = torch.zeros(1, 1, TRACED[0] // 2, TRACED[1] // 2, dtype=torch.uint8)
     luma = torch.zeros(1, 1, *TRACED, dtype=torch.uint8)
@@ -195,6 +205,7 @@ def _traced(module: nn.Module, state: State | None, divisor: int, metadata: dict
     model = program.model_proto
     graph = model.graph
     _name_slopes(module, graph)
+    _keep_biases(module, graph)
     for traced in (*graph.node, *graph.value_info, *graph.initializer, *graph.input, *graph.output):
         del traced.metadata_props[:]  # where in whose files it was traced: half a megabyte that says nothing to a client
     for key, value in {"gamesr_format": FORMAT_VERSION, **metadata}.items():

@@ -8,7 +8,7 @@ their weights. A network so narrow that the cells would be a third of its layers
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Literal, Self, cast
 
 import torch
@@ -23,6 +23,7 @@ ARCHITECTURE = "lean"
 LEAK = 0.1  # of the ReLUs: without it, and without a norm, whole blocks died within a thousand steps
 BLOCKS = (2, 1, 1)  # a cell's side in pixels of Y, U and V
 CELL = sum(block**2 for block in BLOCKS)  # samples of a cell
+MIDDLE = 128  # about which codes lie where a convolution has them alone: bfloat16 rounds what it gives, and about zero that is finer
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class LeanBlock(nn.Module):
 class Head(nn.Module):
     """What runs where no layer carries the cells: a convolution of the features and one of the cells, (N, C, h, w) each, added up.
 
-    The bias is the second one's, which stays float in an int8 artifact.
+    The bias is the second one's, which stays float in an int8 artifact. The cells, and so the samples, are about zero.
     """
 
     def __init__(self, features: nn.Conv2d, cells: nn.Conv2d) -> None:
@@ -131,8 +132,8 @@ class Lean(Network):
             x = F.leaky_relu(block(x), LEAK) if self.running else block(x)
         if self.running and not self.config.carried:
             cells = cells[:, :, self.reach - 1 : 1 - self.reach, self.reach - 1 : 1 - self.reach]
-            luma = shuffle_channels_last(finish(self.head(x, cells)), self.sides[0])
-            chroma = shuffle_channels_last(finish(self.chroma_head(x, cells)), self.sides[1], 2)
+            luma = shuffle_channels_last(finish(self.head(x, cells) + MIDDLE), self.sides[0])
+            chroma = shuffle_channels_last(finish(self.chroma_head(x, cells) + MIDDLE), self.sides[1], 2)
             return Planes(luma, *torch.split(chroma, 1, 1)), None
         x = self.head(x)
         if not self.running:
@@ -151,7 +152,7 @@ class Lean(Network):
         fuse(self.blocks)
         bases = block_diagonal([base.kernel().detach().double() for base in (self.luma_base, self.chroma_base, self.chroma_base)])
         weight, bias = weight_and_bias(self.stem)
-        weight, bias = INPUT_GAIN / 255 * weight, bias - 0.5 * INPUT_GAIN * weight.sum((1, 2, 3))
+        weight, bias = INPUT_GAIN / 255 * weight, bias - self._gain_of_a_middle * weight.sum((1, 2, 3))
         head, head_bias = (255 * RESIDUAL_GAIN * part for part in weight_and_bias(self.head))
         if self.config.carried:
             onward = torch.zeros_like(bases[:CELL])
@@ -163,6 +164,7 @@ class Lean(Network):
             self.head = convolution(torch.cat((head, bases), 1), head_bias).to(self.weight)
         else:
             luma = self.sides[0] ** 2
+            head_bias = head_bias + MIDDLE * (bases.sum((1, 2, 3)) - 1)
             heads = [
                 Head(convolution(head[part], None), convolution(bases[part], head_bias[part])).to(self.weight)
                 for part in (slice(luma), slice(luma, None))
@@ -177,7 +179,7 @@ class Lean(Network):
         features = self.config.features
         weight, bias = weight_and_bias(deployed.stem)
         weight = 255 / INPUT_GAIN * weight[:features]
-        load_fused(self.stem, convolution(weight, bias[:features] + 0.5 * INPUT_GAIN * weight.sum((1, 2, 3))))
+        load_fused(self.stem, convolution(weight, bias[:features] + self._gain_of_a_middle * weight.sum((1, 2, 3))))
         plain = [weight_and_bias(block) for block in deployed.blocks]
         load_fused(self.blocks, nn.ModuleList(convolution(weight[:features, :features], bias[:features]) for weight, bias in plain))
         if self.config.carried:
@@ -187,10 +189,22 @@ class Lean(Network):
             heads = [cast(Head, head) for head in (deployed.head, deployed.chroma_head)]
             weight = torch.cat([head.features.weight.detach().double() for head in heads])
             bases, bias = (torch.cat(parts) for parts in zip(*(weight_and_bias(head.cells) for head in heads), strict=True))
+            bias = bias - MIDDLE * (bases.sum((1, 2, 3)) - 1)
         load_fused(self.head, convolution(weight / (255 * RESIDUAL_GAIN), bias / (255 * RESIDUAL_GAIN)))
         luma, chroma = self.sides[0] ** 2, self.sides[1] ** 2
         self.luma_base.load_kernel(bases[:luma, :-2])
         self.chroma_base.load_kernel(bases[luma : luma + chroma, -2:-1])
+
+    def apart(self) -> Lean:
+        """The same network in the form that is trained, of which no layer carries the cells once it is deployed."""
+        network = Lean(replace(self.config, channels=self.config.features, carried=False))
+        network.load_state_dict(self.state_dict())
+        return network
+
+    @property
+    def _gain_of_a_middle(self) -> float:
+        """What the stem's input is in training, where what runs gives it zero, negative."""
+        return INPUT_GAIN * (0.5 - (0 if self.config.carried else MIDDLE) / 255)
 
     @property
     def reach(self) -> int:
@@ -199,7 +213,8 @@ class Lean(Network):
 
     def _cells(self, frame: Planes) -> Tensor:
         """Cells (N, 6, H/2 + 2R, W/2 + 2R) of the planes, extended by the R cells that the layers reach."""
-        planes = [F.pad(plane, (self.reach * block,) * 4, mode="replicate") for plane, block in zip(frame, BLOCKS, strict=True)]
+        planes: list[Tensor] = [plane - MIDDLE for plane in frame] if self.running and not self.config.carried else list(frame)
+        planes = [F.pad(plane, (self.reach * block,) * 4, mode="replicate") for plane, block in zip(planes, BLOCKS, strict=True)]
         return torch.cat([F.pixel_unshuffle(plane, block) for plane, block in zip(planes, BLOCKS, strict=True)], 1)
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import onnx
+import torch
 from onnx import helper, numpy_helper
 from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
 
@@ -24,17 +25,17 @@ from client.frames import Frame
 from client.upscaler import copy_padded, plane_shapes
 from client.video import read_frames
 from model.artifact_files import Page, write_artifact
+from model.artifact_weights import network_of_artifact
 from model.calibration import MADE, MADE_FRAMES, Feeds, Made, even_channels, mean_difference
-from model.lean import ARCHITECTURE, CELL
+from model.catalogue import described_network
+from model.export import export_network
+from model.lean import ARCHITECTURE, MIDDLE, Lean
 
 # Not the gates, whose error the state would keep; not what interpolates, which makes the code values themselves; and not a head
 # whose base is apart: a residual of rare large values in 8 bits is what lost most, and such a head is a twentieth of the work.
 QUANTIZED = re.compile(r"network\.(stem|blocks\.\d+(\.conv)?|(chroma_)?head\.features)\.weight")
 HEAD_FEATURES = re.compile(r"network\.(chroma_)?head\.features\.weight")
 CALIBRATION_FRAMES = 8
-
-CODES, MIDDLE = "codes_about_zero", 128
-RESIDUAL = "residual"  # what the head makes of the features, in codes
 
 JOINING = ("Relu", "Add")
 
@@ -52,15 +53,14 @@ def quantize(
     ours and InputError for a clip without frames.
     """
     _, spec = load_session(artifact, "cpu", 1)
-    model = onnx.load(artifact)
     if spec.precision != "float32":
         raise ModelError(f"{artifact} is {spec.precision} already: quantize the float32 artifact")
-    residuals = apart_from_cells(model.graph, spec)
+    model, residuals = with_cells_apart(artifact)
     nodes = _quantized_nodes(model.graph)
     if not nodes:
         raise ModelError(f"{artifact} has no layer that is quantized: it is no GameSR network")
     left_float = [*residuals, *(node.input[0] for node in model.graph.node if node.op_type == "LeakyRelu")]
-    metadata = {entry.key: entry.value for entry in model.metadata_props}
+    metadata = {entry.key: entry.value for entry in onnx.load(artifact).metadata_props}
     footage = _Footage(spec, clips, frames, MADE)
     even_channels(model, footage)
     with tempfile.TemporaryDirectory(prefix="gamesr-quantize-") as folder:
@@ -75,7 +75,7 @@ def quantize(
                 per_channel=True,
                 activation_type=QuantType.QUInt8,
                 weight_type=QuantType.QInt8,
-                extra_options={"TensorQuantOverrides": exact_codes(model.graph)},
+                extra_options={"TensorQuantOverrides": _exact_codes(model.graph) if residuals else {}},
             )
         quantized = onnx.load(whole)
     for tensor in left_float:
@@ -147,70 +147,35 @@ def _quantized_nodes(graph: onnx.GraphProto) -> list[str]:
     return nodes
 
 
-def apart_from_cells(graph: onnx.GraphProto, spec: ModelSpec) -> dict[str, str]:
-    """Keep the picture's cells out of the layers of a `model.lean` network, in place: 8 bits do for features, not for codes beside them.
+def with_cells_apart(artifact: Path) -> tuple[onnx.ModelProto, dict[str, str]]:
+    """The float32 graph that is brought to 8 bits: of a `model.lean` network with the picture's cells beside its layers, about zero.
 
-    The stem is given codes about zero. Returns the tensors that heads make of the features, in codes, and for each the bias that can give
-    back what 8 bits take from it in the mean (Nagel et al. 2019, section 4.2). Any other network stays as it is, and has none.
+    8 bits do for features, not for codes beside them; about zero, what they do to a weight counts for detail alone, not for how bright
+    a picture is. With it the tensors that heads make of the features, in codes, and for each the bias that can give back what 8 bits
+    take from it in the mean (Nagel et al. 2019, section 4.2). The graph of any other network stays as it is, and has none.
     """
-    described = spec.card.get("network", {})
+    model = onnx.load(artifact)
+    described = load_session(artifact, "cpu", 1)[1].card.get("network", {})
     if described.get("architecture") != ARCHITECTURE:
-        return {}
-    if described.get("carried", True):
-        _split_carried_cells(graph)
-    tensors = {tensor.name: tensor for tensor in graph.initializer}
-    stem = next(node for node in graph.node if node.op_type == "Conv")
-    # About zero, what 8 bits do to a weight counts for detail alone, not for how bright a picture is.
-    bias = tensors[stem.input[2]]
-    gain = numpy_helper.to_array(tensors[stem.input[1]]).sum((1, 2, 3), dtype=np.float64)
-    bias.CopyFrom(numpy_helper.from_array((numpy_helper.to_array(bias) + MIDDLE * gain).astype(np.float32), bias.name))
-    graph.initializer.append(numpy_helper.from_array(np.array(MIDDLE, np.float32), "middle"))
-    graph.node.insert(list(graph.node).index(stem), helper.make_node("Sub", [stem.input[0], "middle"], [CODES], name=CODES))
-    stem.input[0] = CODES
-    heads = [node for node in graph.node if node.op_type == "Conv" and HEAD_FEATURES.fullmatch(node.input[1])]
-    return {head.output[0]: head.input[1].replace("features.weight", "cells.bias") for head in heads}
+        return model, {}
+    network, deployed = described_network(described), network_of_artifact(artifact)
+    assert isinstance(network, Lean) and isinstance(deployed, Lean)
+    if network.config.carried:
+        with torch.random.fork_rng(devices=()):
+            torch.manual_seed(0)  # there is chance in a training form; with the same, the same artifact comes of the same input
+            network.load_deployed(deployed)
+        with tempfile.TemporaryDirectory(prefix="gamesr-quantize-") as folder:
+            apart = Path(folder) / "apart.onnx"
+            export_network(network.apart(), apart, name=artifact.stem, card={})
+            model = onnx.load(apart)
+    heads = [node for node in model.graph.node if node.op_type == "Conv" and HEAD_FEATURES.fullmatch(node.input[1])]
+    return model, {head.output[0]: head.input[1].replace("features.weight", "cells.bias") for head in heads}
 
 
-def _split_carried_cells(graph: onnx.GraphProto) -> None:
-    """Make two of a head that reads features and cells: one of the features, one of the cells, cut to what the layers would have left."""
-    tensors = {tensor.name: tensor for tensor in graph.initializer}
-    stem, *blocks, head = (node for node in graph.node if node.op_type == "Conv")
-    features = numpy_helper.to_array(tensors[stem.input[1]]).shape[0] - CELL
-    for conv in (stem, *blocks):
-        inputs = CELL if conv is stem else features
-        for name, part in ((conv.input[1], np.s_[:features, :inputs]), (conv.input[2], np.s_[:features])):
-            tensors[name].CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensors[name])[part].copy(), name))
-    weight = numpy_helper.to_array(tensors[head.input[1]])
-    cut = 1 + len(blocks)
-    new = {
-        "network.head.features.weight": weight[:, :features],
-        "network.head.cells.weight": weight[:, features:],
-        "network.head.cells.bias": np.zeros(len(weight), np.float32),
-        "starts": np.array([cut, cut]),
-        "ends": np.array([-cut, -cut]),
-        "axes": np.array([2, 3]),
-    }
-    graph.initializer.extend(numpy_helper.from_array(array.copy(), name) for name, array in new.items())
-    graph.initializer.remove(tensors[head.input[1]])
-    cells, source = stem.input[0], head.input[0]
-    instead = [
-        helper.make_node("Conv", [source, "network.head.features.weight", head.input[2]], [RESIDUAL], name=RESIDUAL),
-        helper.make_node("Slice", [cells, "starts", "ends", "axes"], ["head_source"], name="head_source"),
-        helper.make_node(
-            "Conv", ["head_source", "network.head.cells.weight", "network.head.cells.bias"], ["head_cells"], name="head_cells"
-        ),
-        helper.make_node("Add", [RESIDUAL, "head_cells"], list(head.output), name="head"),
-    ]
-    nodes = [part for node in graph.node for part in (instead if node.name == head.name else [node])]
-    del graph.node[:]
-    graph.node.extend(nodes)
-    del graph.value_info[:]  # whose shapes are those of the wider layers
-
-
-def exact_codes(graph: onnx.GraphProto) -> dict[str, list[dict[str, Any]]]:
-    """What the quantizer is told of the codes about zero, where there are any: each has a number of its own."""
-    there = any(CODES in node.output for node in graph.node)
-    return {CODES: [{"scale": np.array(1, np.float32), "zero_point": np.array(MIDDLE, np.uint8)}]} if there else {}
+def _exact_codes(graph: onnx.GraphProto) -> dict[str, list[dict[str, Any]]]:
+    """What the quantizer is told of the codes about zero that the first convolution reads: each has a number of its own."""
+    codes = next(node for node in graph.node if node.op_type == "Conv").input[0]
+    return {codes: [{"scale": np.array(1, np.float32), "zero_point": np.array(MIDDLE, np.uint8)}]}
 
 
 def leave_float(graph: onnx.GraphProto, tensor: str) -> None:

@@ -116,3 +116,18 @@ def test_a_flat_picture_is_flat_at_every_code_where_the_base_runs_in_bfloat16(sc
         cells = torch.cat((torch.zeros(1, network.config.features, 3, 3), torch.full((1, CELL, 3, 3), float(code))), 1)
         picture: Tensor = F.conv2d(cells, weight, network.head.bias)
         assert (picture - code).abs().max() < 1e-2
+
+
+@pytest.mark.parametrize("scale", [2, 3])
+def test_what_cells_give_by_themselves_is_about_zero_where_bfloat16_is_fine(scale: int) -> None:
+    """A runtime in bfloat16 rounds it before the features' part is added: of chroma within 16 codes of grey by a thirtieth of a code."""
+    network = random_network("fast", scale).deployed().double()
+    given: list[Tensor] = []
+    network.chroma_head.cells.register_forward_hook(lambda module, inputs, samples: given.append(samples))
+    clip = random_clip(1, 1, 32, 48)
+    chroma = [120 + plane[:, 0] / 16 for plane in (clip.u, clip.v)]
+    network.step(Planes(clip.y[:, 0], *chroma), None)
+    bias = network.chroma_head.cells.bias.detach()[:, None, None]
+    (samples,) = (x - bias for x in given)
+    assert samples.abs().max() < 16
+    assert (samples.bfloat16() - samples).abs().max() < 1 / 30

@@ -21,7 +21,7 @@ from model.export import export_baseline, export_network
 from model.lean import Lean, LeanConfig
 from model.network import GameSR, NetworkConfig
 from model.planes import Network
-from model.quantize import CODES, apart_from_cells, quantize
+from model.quantize import quantize, with_cells_apart
 from model.quantize_cli import main
 from model.trial import BOUNDS
 from tests.moving import picture, write_footage
@@ -89,15 +89,15 @@ def test_int8_comes_near_the_float32_artifact(folder: Path, name: str, provider:
         assert 0 < np.square(rounded - exact).mean() < 0.01 * np.square(exact - nothing).mean(), plane
 
 
-@pytest.mark.parametrize(("name", "heads"), [("carrying", 1), ("apart", 2)])
-def test_codes_keep_their_numbers_and_what_is_added_to_the_interpolation_stays_float(folder: Path, name: str, heads: int) -> None:
-    exact = onnx.load(folder / f"{name}.onnx")
-    residuals = apart_from_cells(exact.graph, OnnxUpscaler(folder / f"{name}.onnx", threads=1).spec)
+@pytest.mark.parametrize("name", ["carrying", "apart"])
+def test_codes_keep_their_numbers_and_what_is_added_to_the_interpolation_stays_float(folder: Path, name: str) -> None:
+    exact, residuals = with_cells_apart(folder / f"{name}.onnx")
+    codes = next(node for node in exact.graph.node if node.op_type == "Conv").input[0]
     graph = onnx.load(folder / f"{name}-int8.onnx").graph
     tensors = {t.name: numpy_helper.to_array(t) for t in graph.initializer}
-    (codes_down,) = (node for node in graph.node if node.op_type == "QuantizeLinear" and node.input[0] == CODES)
+    (codes_down,) = (node for node in graph.node if node.op_type == "QuantizeLinear" and node.input[0] == codes)
     assert (tensors[codes_down.input[1]], tensors[codes_down.input[2]]) == (1, 128)
-    assert [[node.op_type for node in graph.node if residual in node.input] for residual in residuals] == [["Add"]] * heads
+    assert [[node.op_type for node in graph.node if residual in node.input] for residual in residuals] == [["Add"]] * 2
     source = {node.output[0]: node.op_type for node in graph.node}
     assert {source[node.input[0]] for node in graph.node if node.op_type == "LeakyRelu"} == {"Conv"}
     assert not {name for name in tensors if name.endswith(("_scale", "_zero_point"))} - {name for n in graph.node for name in n.input}
@@ -118,14 +118,12 @@ def test_weights_are_symmetric_per_channel_and_what_must_stay_float_does(folder:
         assert source[source[conv.input[0]].input[0]].op_type == "QuantizeLinear"
         assert tensors[source[conv.input[0]].input[2]].dtype == np.uint8
         int8_weights.add(source[conv.input[1]].input[0].removeprefix("network.").removesuffix(".weight_quantized"))
-    if name == "carrying":
-        assert int8_weights == {"stem", "blocks.0", "blocks.1", "head.features"} and float_weights == {"head.cells"}
-    elif name == "apart":
-        assert int8_weights == {"stem", "blocks.0", "blocks.1", "head.features", "chroma_head.features"}
-        assert float_weights == {"head.cells", "chroma_head.cells"}
-    else:
+    if name == "recurrent":
         assert int8_weights == {"stem", "blocks.0.conv"}
         assert float_weights == {"lstm.gates", "head", "luma_base", "chroma_base"}
+    else:
+        assert int8_weights == {"stem", "blocks.0", "blocks.1", "head.features", "chroma_head.features"}
+        assert float_weights == {"head.cells", "chroma_head.cells"}
 
 
 def test_nothing_in_8_bits_depends_on_the_state(folder: Path) -> None:
@@ -149,26 +147,33 @@ def test_it_is_the_same_model_to_the_client_but_for_its_precision(folder: Path, 
     assert ours.card == {**theirs.card, "quantized_from": theirs.sha256, "calibration": ["clip.mkv (6 frames)", *made]}
 
 
-@pytest.mark.parametrize("name", ["carrying", "apart"])
-def test_without_the_cells_in_its_layers_it_is_the_same_network(folder: Path, tmp_path: Path, name: str) -> None:
-    model = onnx.load(folder / f"{name}.onnx")
-    apart_from_cells(model.graph, OnnxUpscaler(folder / f"{name}.onnx", threads=1).spec)
-    onnx.save(model, tmp_path / "split.onnx")
+def test_without_the_cells_in_its_layers_it_is_the_same_network(folder: Path, tmp_path: Path) -> None:
+    model, _ = with_cells_apart(folder / "carrying.onnx")
+    features = [node for node in model.graph.node if node.op_type == "LeakyRelu"]
+    sizes = [seen[node.output[0]].shape[1] for node in features for seen in observed(model, [node.output[0]], [planes(picture(0, 48, 64))])]
+    assert sizes == [8, 8, 8]
+    onnx.save(model, tmp_path / "apart.onnx")
     frames = list(hard_cases.noise(48, 32, 4))
-    error = codes(tmp_path / "split.onnx", frames) - codes(folder / f"{name}.onnx", frames)
+    error = codes(tmp_path / "apart.onnx", frames) - codes(folder / "carrying.onnx", frames)
     assert np.abs(error).max() <= 1 and np.count_nonzero(error) < 1e-3 * error.size
 
 
-def test_a_network_that_carries_no_cells_stays_as_it_is(folder: Path) -> None:
-    apart = onnx.load(folder / "recurrent.onnx")
-    assert apart_from_cells(apart.graph, OnnxUpscaler(folder / "recurrent.onnx", threads=1).spec) == {}
-    assert apart == onnx.load(folder / "recurrent.onnx")
+def test_the_same_artifact_comes_of_the_same_input(folder: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again.onnx"
+    quantize(folder / "carrying.onnx", again, [folder / "clip.mkv"], name="carrying-int8", frames=6)
+    assert again.read_bytes() == (folder / "carrying-int8.onnx").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["apart", "recurrent"])
+def test_a_network_that_carries_no_cells_stays_as_it_is(folder: Path, name: str) -> None:
+    model, residuals = with_cells_apart(folder / f"{name}.onnx")
+    assert model == onnx.load(folder / f"{name}.onnx")
+    assert len(residuals) == {"apart": 2, "recurrent": 0}[name]
 
 
 @pytest.mark.parametrize("network", ["carrying", "apart"])
 def test_channels_made_even_leave_the_network_as_it_is_and_reach_as_far_as_each_other(folder: Path, tmp_path: Path, network: str) -> None:
-    before = onnx.load(folder / f"{network}.onnx")
-    residuals = apart_from_cells(before.graph, OnnxUpscaler(folder / f"{network}.onnx", threads=1).spec)
+    before, residuals = with_cells_apart(folder / f"{network}.onnx")
     even = onnx.load_from_string(before.SerializeToString())
     feeds = [planes(frame) for frame in hard_cases.noise(48, 32, 3)]
     even_channels(even, feeds)
@@ -189,8 +194,7 @@ def test_channels_made_even_leave_the_network_as_it_is_and_reach_as_far_as_each_
 
 
 def test_channels_that_something_else_reads_are_left_and_dead_ones_stay_finite(folder: Path) -> None:
-    model = onnx.load(folder / "carrying.onnx")
-    apart_from_cells(model.graph, OnnxUpscaler(folder / "carrying.onnx", threads=1).spec)
+    model, _ = with_cells_apart(folder / "carrying.onnx")
     tensors = {t.name: t for t in model.graph.initializer}
     for name in ("network.blocks.0.weight", "network.blocks.0.bias"):
         tensors[name].CopyFrom(numpy_helper.from_array(0 * numpy_helper.to_array(tensors[name]), name))
@@ -205,14 +209,14 @@ def test_channels_that_something_else_reads_are_left_and_dead_ones_stay_finite(f
 
 
 def test_the_mean_difference_is_that_of_each_channel(folder: Path) -> None:
-    model = onnx.load(folder / "carrying.onnx")
-    apart_from_cells(model.graph, OnnxUpscaler(folder / "carrying.onnx", threads=1).spec)
+    model, _ = with_cells_apart(folder / "carrying.onnx")
     other = onnx.load_from_string(model.SerializeToString())
-    bias = next(t for t in other.graph.initializer if t.name == "network.head.bias")
-    shift = np.arange(24, dtype=np.float32)
+    bias = next(t for t in other.graph.initializer if t.name == "network.head.cells.bias")
+    shift = np.arange(16, dtype=np.float32)
     bias.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(bias) - shift, bias.name))
+    cells = next(node for node in model.graph.node if node.op_type == "Conv" and bias.name in node.input)
     feeds = [planes(frame) for size in (48, 64) for frame in hard_cases.noise(size, 32, 2)]
-    np.testing.assert_allclose(mean_difference(model, other, "residual", feeds), shift, atol=1e-3)
+    np.testing.assert_allclose(mean_difference(model, other, cells.output[0], feeds), shift, atol=1e-3)
 
 
 @pytest.mark.parametrize("case", ["lines", "text", "noise"])
