@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from client.artifact import ORT_PROVIDERS, ModelSpec, load_session, read_artifact
 from client.errors import ModelError, ProviderError
 from client.norms import norms_in_place
+from client.precise import states_in_float32
 
 Array = NDArray[np.generic]
 BFLOAT16 = "openvino-bfloat16"
@@ -154,6 +155,8 @@ class OpenVinoRuntime:
                 if self._precision != "f16":  # where it has not been measured
                     norms_in_place(self._ov, model)
                 model.reshape({name: list(shape) for name, shape in shapes.items()})
+                if self._precision == "bf16":
+                    model = states_in_float32(self._ov, self._core, model)
                 self._compiled[key] = self._core.compile_model(model, "CPU", self._options).create_infer_request()
             except Exception as error:  # the runtime's exceptions have no common base
                 reason = str(error).strip().splitlines()[-1]
