@@ -78,7 +78,10 @@ class SkippingUpscaler:
         return SkippingState(_Memory(grid, state), restarted=False, computed_share=0.0)
 
     def step(self, frame: Frame, state: SkippingState) -> tuple[Frame, SkippingState]:
-        """Upscale one frame, as `OnnxUpscaler.step` does and with what it raises; the planes returned are not to be written to."""
+        """Upscale one frame, as `OnnxUpscaler.step` does and with what it raises.
+
+        The frame is kept for the next step: neither it nor the picture is to be written to.
+        """
         if (frame.height, frame.width) != (state.height, state.width):
             raise ValueError(f"a {frame.width}x{frame.height} frame for a state of {state.width}x{state.height}")
         memory = state._take()
@@ -125,7 +128,7 @@ def skipping_upscaler(upscaler: OnnxUpscaler) -> Upscaler[Any]:
 
 
 class _Memory:
-    """One stream: the planes of this frame and the one before, filled up to the grid, the last picture, and the tiles' ages.
+    """One stream: the last decoded frame, nobody writes to it, the last picture, and the tiles' ages.
 
     `ages` holds, for each tile, in how many frames it was computed from the input that it has; up to 255.
     """
@@ -134,19 +137,31 @@ class _Memory:
         self.grid, self.state = grid, state
         self.picture: Frame | None = None
         self.ages = np.zeros(grid.shape, np.uint8)
+        self._decoded: Frame | None = None
+        self._padded: Frame | None = None  # the one that `_after` holds
         # What no frame covers stays zero, and so never differs.
         self._before, self._after = ([np.zeros(shape, np.uint8) for shape in grid.plane_shapes()] for _ in range(2))
 
     def load(self, frame: Frame) -> Mask:
-        """Take a frame, padded as the model's input is; gives the tiles whose input, with the halo, differs from the last one."""
-        self._before, self._after = self._after, self._before
-        for plane, target, shape in zip(
-            (frame.y, frame.u, frame.v), self._after, plane_shapes(self.grid.height, self.grid.width), strict=True
-        ):
-            copy_padded(plane, target[: shape[0], : shape[1]])
-        changed = self.grid.changed(self._before, self._after)
+        """Take a frame; gives the tiles whose input, with the halo, differs from the last one, or all where most of them do."""
+        before, self._decoded = self._decoded, frame
+        if before is None or self.grid.is_in_motion(before.y, frame.y):
+            changed = np.ones(self.grid.shape, bool)
+        else:
+            if self._padded is not before:
+                self._pad(before)
+            self._before, self._after = self._after, self._before
+            self._pad(frame)
+            changed = self.grid.changed(self._before, self._after)
         self.ages[changed] = 0
         return changed
+
+    def _pad(self, frame: Frame) -> None:
+        """Into `_after`, as the model's input is."""
+        shapes = plane_shapes(self.grid.height, self.grid.width)
+        for plane, target, (height, width) in zip((frame.y, frame.u, frame.v), self._after, shapes, strict=True):
+            copy_padded(plane, target[:height, :width])
+        self._padded = frame
 
     def count(self, computed: Mask | slice, *, begin_anew: bool = False) -> None:
         if begin_anew:
@@ -155,6 +170,5 @@ class _Memory:
 
     def copy(self) -> _Memory:
         twin = _Memory(self.grid, self.state.copy())
-        twin.picture, twin.ages = self.picture, self.ages.copy()
-        twin._after = [plane.copy() for plane in self._after]
+        twin.picture, twin.ages, twin._decoded = self.picture, self.ages.copy(), self._decoded
         return twin

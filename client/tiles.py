@@ -82,6 +82,16 @@ class TileGrid:
         rows = total[bottom] - total[top]
         return np.asarray(rows[:, right] > rows[:, left])
 
+    def is_in_motion(self, before: Plane, after: Plane) -> bool:
+        """Whether so many tiles changed that all of a frame is to be computed, by one row of each in the luma of two frames.
+
+        In motion that mostly tells, at a thirtieth of the time of looking at everything.
+        """
+        rows, columns = (size // self.tile for size in before.shape)
+        old, new = (plane[self.tile // 2 : rows * self.tile : self.tile, : columns * self.tile] for plane in (before, after))
+        differs = (old != new).reshape(rows, columns, self.tile).any(2)
+        return bool(differs.any() and differs.mean() > WORTH_IT)
+
     def windows(self, due: Mask) -> list[Window] | None:
         """Windows that hold every tile of `due`, at the least cost that joining neighbours finds; None for the whole frame."""
         pieces = _pieces(due)

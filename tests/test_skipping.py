@@ -19,6 +19,7 @@ from client.pipeline import Restart, upscale_stream
 from client.quality import squared_error
 from client.sink import NullSink
 from client.skipping import SETTLING_FRAMES, SkippingState, SkippingUpscaler
+from client.tiles import TileGrid
 from client.upscaler import OnnxUpscaler
 from client.video import Decoded
 from model.export import export_network
@@ -130,6 +131,22 @@ def test_full_motion_is_one_whole_run_a_frame_and_the_same_to_the_bit(spies: dic
     steps = list(through(SkippingUpscaler(spy), frames))
     assert spy.taken() == [(70, 90)] * 4
     assert all(same(picture, whole_picture) for (picture, _), whole_picture in zip(steps, expected, strict=True))
+
+
+def test_in_full_motion_one_row_of_a_tile_tells(spies: dict[str, Spy], monkeypatch: pytest.MonkeyPatch) -> None:
+    looked: list[bool] = []
+    monkeypatch.setattr(TileGrid, "changed", lambda *planes: looked.append(True) or np.ones((7, 9), bool))
+    frames = [noise(0), noise(1), noise(2), changed(noise(2), 0, 0, 3, 3)]
+    assert [state.computed_share for _, state in through(SkippingUpscaler(spies["bicubic_x2"]), frames)] == [1] * 4
+    assert looked == [True]
+
+
+@pytest.mark.parametrize("plane", ["u", "v"])
+def test_what_changed_in_chroma_alone_is_seen(spies: dict[str, Spy], plane: str) -> None:
+    """Whose rows no first look is taken at, after motion in which nothing else was."""
+    frames = [noise(0), noise(1), replace(noise(1), **{plane: getattr(noise(2), plane)})]
+    steps = list(through(SkippingUpscaler(spies["bicubic_x2"]), frames))
+    assert all(same(picture, whole(spies["bicubic_x2"], frame)) for frame, (picture, _) in zip(frames, steps, strict=True))
 
 
 @pytest.mark.parametrize(
