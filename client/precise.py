@@ -22,12 +22,13 @@ MARKS = (
 def states_in_float32(ov: ModuleType, core: Any, model: Any) -> Any:
     """An `openvino.Model` of which every operation between a state that comes in and one that goes out stays float32; the same if none.
 
-    An error there comes back with every frame. In bfloat16, which rounds what goes into an operation and what comes out of it, a state
-    does not come to rest in a still, and cells that forget next to nothing go astray. What a convolution makes of anything
-    but the state is an operation of its own then and stays fast: half of the gates' work. Python cannot mark an operation, so
-    the model is written in OpenVINO's format, marked and read again. `model` is no longer to be used.
+    An error there comes back with every frame: in bfloat16, which rounds what goes into an operation and what comes out of it, a state
+    does not come to rest in a still. What a convolution makes of anything but the state is an operation of its own then and
+    stays fast: half of the gates' work. Python cannot mark an operation, so the model is written in OpenVINO's format, marked and
+    read again. `model` is no longer to be used.
     """
     _take_apart(ov, model)
+    _name_apart(model)
     names = {node.get_friendly_name() for node in _between_states(model)}
     if not names:
         return model
@@ -55,13 +56,24 @@ def _take_apart(ov: ModuleType, model: Any) -> None:
         if (joined.get_type_name(), weight.get_type_name()) != ("Concat", "Constant") or joined.get_attributes()["axis"] != 1:
             continue
         parts = joined.input_values()
-        if not any(part.get_node().get_type_name() == "Parameter" for part in parts):
+        reads_a_state = any(part.get_node().get_type_name() == "Parameter" for part in parts)
+        if not reads_a_state or any(part.get_partial_shape()[1].is_dynamic for part in parts):
             continue
         ends = np.cumsum([part.get_partial_shape()[1].get_length() for part in parts])
         how = {name: node.get_attributes()[name] for name in ("strides", "pads_begin", "pads_end", "dilations", "auto_pad")}
         pieces = np.split(weight.get_data(), ends[:-1], 1)
         convolved = [ops.convolution(part, ops.constant(piece.copy()), **how) for part, piece in zip(parts, pieces, strict=True)]
         node.output(0).replace(functools.reduce(ops.add, convolved).output(0))
+
+
+def _name_apart(model: Any) -> None:
+    """Give another name to operations that share one, as an artifact's may, or whose name XML does not hold."""
+    taken: set[str] = set()
+    for index, node in enumerate(model.get_ordered_ops()):
+        name = node.get_friendly_name()
+        if name in taken or not name.isprintable():
+            node.set_friendly_name(f"operation {index}")
+        taken.add(node.get_friendly_name())
 
 
 def _between_states(model: Any) -> set[Any]:

@@ -63,7 +63,10 @@ class RepeatUpscaler:
         return RepeatState(self._upscaler.initial_state(height, width), None, restarted=False, computed_share=0.0)
 
     def step(self, frame: Frame, state: RepeatState) -> tuple[Frame, RepeatState]:
-        """Upscale one frame, as `OnnxUpscaler.step` does and with what it raises; the planes returned are not to be written to."""
+        """Upscale one frame, as `OnnxUpscaler.step` does and with what it raises.
+
+        The frame is kept for the next step: neither it nor the picture is to be written to.
+        """
         shown, memory = state.shown, state._take()
         if shown is not None and (picture := shown.again(frame)) is not None:
             return picture, RepeatState(memory, shown, restarted=False, computed_share=0.0)

@@ -159,7 +159,7 @@ class OpenVinoRuntime:
                     model = states_in_float32(self._ov, self._core, model)
                 self._compiled[key] = self._core.compile_model(model, "CPU", self._options).create_infer_request()
             except Exception as error:  # the runtime's exceptions have no common base
-                reason = str(error).strip().splitlines()[-1]
+                reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
                 raise ModelError(f"OpenVINO cannot compile the model: {reason}") from error
         return self._compiled[key]
 

@@ -130,7 +130,8 @@ def skipping_upscaler(upscaler: OnnxUpscaler) -> Upscaler[Any]:
 class _Memory:
     """One stream: the last decoded frame, nobody writes to it, the last picture, and the tiles' ages.
 
-    `ages` holds, for each tile, in how many frames it was computed from the input that it has; up to 255.
+    `ages` holds, for each tile, in how many frames it was computed from the input that it has, at least; up to 255. In a frame in
+    motion every tile counts as changed, also one that was not looked at.
     """
 
     def __init__(self, grid: TileGrid, state: State) -> None:
@@ -146,7 +147,7 @@ class _Memory:
         """Take a frame; gives the tiles whose input, with the halo, differs from the last one, or all where most of them do."""
         before, self._decoded = self._decoded, frame
         if before is None or self.grid.is_in_motion(before.y, frame.y):
-            changed = np.ones(self.grid.shape, bool)
+            changed, self._padded = np.ones(self.grid.shape, bool), None
         else:
             if self._padded is not before:
                 self._pad(before)

@@ -172,11 +172,15 @@ def _name_slopes(module: nn.Module, graph: onnx.GraphProto) -> None:
 def _keep_biases(module: nn.Module, graph: onnx.GraphProto) -> None:
     """Give convolutions back the biases that the exporter leaves out for being zero, as in a head that has learned nothing yet."""
     biases = {f"{name}.weight": part.bias for name, part in module.named_modules() if isinstance(part, nn.Conv2d)}
+    there = {tensor.name for tensor in graph.initializer}
     for node in graph.node:
         bias = biases.get(node.input[1]) if node.op_type == "Conv" and len(node.input) == 2 else None
         if bias is not None:
-            node.input.append(node.input[1].removesuffix("weight") + "bias")
-            graph.initializer.append(onnx.numpy_helper.from_array(bias.detach().numpy(), node.input[2]))
+            name = node.input[1].removesuffix("weight") + "bias"
+            node.input.append(name)
+            if name not in there:
+                graph.initializer.append(onnx.numpy_helper.from_array(bias.detach().numpy(), name))
+                there.add(name)
 
 
 def _traced(module: nn.Module, state: State | None, divisor: int, metadata: dict[str, Any]) -> onnx.ModelProto:

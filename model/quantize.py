@@ -84,7 +84,9 @@ def quantize(
         lost = mean_difference(model, quantized, residual, _Footage(spec, clips, frames))
         tensor = next(tensor for tensor in quantized.graph.initializer if tensor.name == bias)
         tensor.CopyFrom(numpy_helper.from_array((numpy_helper.to_array(tensor) + lost).astype(np.float32), bias))
-    card = {**spec.card, "quantized_from": spec.sha256, "calibration": footage.played}
+    runs = json.loads(next((entry.value for entry in model.metadata_props if entry.key == "card"), "{}"))
+    counts = {key: runs[key] for key in ("parameters", "macs_540p") if key in runs}  # of the form that was brought to 8 bits
+    card = {**spec.card, **counts, "quantized_from": spec.sha256, "calibration": footage.played}
     helper.set_model_props(quantized, {**metadata, "name": name, "precision": "int8", "card": json.dumps(card)})
     onnx.checker.check_model(quantized, full_check=True)
     write_artifact(quantized, path, page and page(name, spec.scale, card))

@@ -56,6 +56,16 @@ def test_parity_notices_a_wrong_weight(artifacts: dict[str, Path], tmp_path: Pat
     assert not torch.allclose(reference(clip)[0].y, changed(clip)[0].y)
 
 
+def test_a_bias_that_is_zero_stays_in_the_artifact(tmp_path: Path) -> None:
+    """The exporter leaves it out, and then nothing could be held against the artifact or go on from it."""
+    network = random_network("fast", 2)
+    torch.nn.init.zeros_(network.stem.bias)
+    torch.nn.init.zeros_(network.stem.weight)
+    export_network(network, tmp_path / "fast_x2.onnx", name="fast", card={})
+    assert not network_of_artifact(tmp_path / "fast_x2.onnx").stem.bias.any()
+    assert max(error.max_code_error for error in parity(tmp_path / "fast_x2.onnx", frames(24, 40), 4)) <= 1
+
+
 def test_the_artifact_says_what_it_is(artifacts: dict[str, Path]) -> None:
     spec = OnnxUpscaler(artifacts["planes_x3"], threads=1).spec
     assert (spec.name, spec.scale, spec.size_multiple, spec.precision) == ("planes", 3, 2, "float32")

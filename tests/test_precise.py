@@ -78,6 +78,42 @@ def test_what_a_state_does_not_come_through_or_does_not_leave_by_is_not_on_its_w
     total = ops.add(tripled, state)
     picture = ops.convert(ops.sqrt(total), "u8")
     marked = states_in_float32(openvino, core, openvino.Model([total, picture], [plane, state], "small"))
-    notes = {node.get_type_name(): [key for key, _ in node.get_rt_info().items()] for node in marked.get_ordered_ops()}
-    kept = {kind for kind, keys in notes.items() if any("recision" in key for key in keys)}
-    assert kept == {"Add"} < notes.keys()
+    kinds = [
+        (node.get_type_name(), any(key.startswith(("DisablePrecision", "precise")) for key, _ in node.get_rt_info().items()))
+        for node in marked.get_ordered_ops()
+    ]
+    assert [kind for kind, is_kept in kinds if is_kept] == ["Add"]
+    assert [kind for kind, _ in kinds].count("Convert") == 2
+
+
+def gates(channels: int | openvino.Dimension, *, weight: Any = None) -> Any:
+    """A state of 4 channels from one convolution of an input's channels beside it."""
+    plane = ops.parameter(openvino.PartialShape([1, channels, 8, 8]), np.uint8, name="plane")
+    state = ops.parameter([1, 4, 8, 8], np.float32, name="state")
+    joined = ops.concat([ops.convert(plane, "f32"), state], 1)
+    kernel = ops.constant(np.random.default_rng(0).normal(size=(4, 6, 3, 3)).astype(np.float32)) if weight is None else weight
+    total = ops.convolution(joined, kernel, [1, 1], [1, 1], [1, 1], [1, 1])
+    return openvino.Model([ops.sigmoid(total)], [plane, state], "gates")
+
+
+@pytest.mark.parametrize("channels", [2, openvino.Dimension(-1)], ids=["known", "unknown"])
+def test_what_cannot_be_taken_apart_is_kept_whole(channels: int | openvino.Dimension) -> None:
+    core = openvino.Core()
+    model = states_in_float32(openvino, core, gates(channels))
+    kinds = [node.get_type_name() for node in model.get_ordered_ops()]
+    assert (kinds.count("Convolution"), kinds.count("Concat")) == ((2, 0) if channels == 2 else (1, 1))
+    core.compile_model(model, "CPU")
+
+
+@pytest.mark.parametrize("name", ["twice", "a\x01b", "<&\"'>"])
+def test_operations_of_any_name_are_told_from_each_other(name: str) -> None:
+    core = openvino.Core()
+    model = gates(2)
+    for node in model.get_ordered_ops():
+        if node.get_type_name() in ("Convert", "Sigmoid"):
+            node.set_friendly_name(name)
+    marked = {
+        node.get_type_name(): any(key.startswith(("DisablePrecision", "precise")) for key, _ in node.get_rt_info().items())
+        for node in states_in_float32(openvino, core, model).get_ordered_ops()
+    }
+    assert marked["Sigmoid"] and marked["Add"] and not marked["Convert"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -144,7 +145,11 @@ def test_it_is_the_same_model_to_the_client_but_for_its_precision(folder: Path, 
     assert (ours.name, ours.precision, theirs.precision) == (f"{name}-int8", "int8", "float32")
     assert (ours.scale, ours.size_multiple, ours.state, ours.reach) == (theirs.scale, theirs.size_multiple, theirs.state, theirs.reach)
     made = [f"made {what} (16 frames)" for what in ("lines, 160x96", "text, 160x96", "noise, 160x96", "noise, 160x2", "noise, 2x96")]
-    assert ours.card == {**theirs.card, "quantized_from": theirs.sha256, "calibration": ["clip.mkv (6 frames)", *made]}
+    counts = {key: ours.card[key] for key in ("parameters", "macs_540p") if key in ours.card}
+    assert ours.card == {**theirs.card, **counts, "quantized_from": theirs.sha256, "calibration": ["clip.mkv (6 frames)", *made]}
+    graph = onnx.load(folder / f"{name}-int8.onnx").graph
+    weights = [t for t in graph.initializer if re.search(r"network\..*(weight|bias)(_quantized)?$", t.name)]
+    assert "parameters" not in counts or counts["parameters"] == sum(np.prod(t.dims, dtype=int) for t in weights)
 
 
 def test_without_the_cells_in_its_layers_it_is_the_same_network(folder: Path, tmp_path: Path) -> None:

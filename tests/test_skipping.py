@@ -141,6 +141,17 @@ def test_in_full_motion_one_row_of_a_tile_tells(spies: dict[str, Spy], monkeypat
     assert looked == [True]
 
 
+@pytest.mark.parametrize(("tiles", "in_motion"), [(42, False), (43, True)])
+def test_motion_is_more_than_seven_eighths_of_the_whole_tiles(tiles: int, in_motion: bool) -> None:
+    """Of 6x8; those that the frame cuts off are not looked at."""
+    grid = TileGrid(HEIGHT, WIDTH, multiple=2, halo=4)
+    before, after = noise(0).y, noise(0).y
+    for tile in range(tiles):
+        after[tile // 8 * 32 + 16, tile % 8 * 32] += 1
+    assert grid.is_in_motion(before, after) is in_motion
+    assert not TileGrid(20, 20, multiple=2, halo=4).is_in_motion(before[:20, :20], 255 - after[:20, :20])
+
+
 @pytest.mark.parametrize("plane", ["u", "v"])
 def test_what_changed_in_chroma_alone_is_seen(spies: dict[str, Spy], plane: str) -> None:
     """Whose rows no first look is taken at, after motion in which nothing else was."""
