@@ -203,7 +203,7 @@ class Lean(Network):
 
     @property
     def _gain_of_a_middle(self) -> float:
-        """What the stem's input is in training, where what runs gives it zero, negative."""
+        """Minus the stem's input in training where what runs gives it zero."""
         return INPUT_GAIN * (0.5 - (0 if self.config.carried else MIDDLE) / 255)
 
     @property
