@@ -64,6 +64,10 @@ def _lines(name: str, scale: int, card: Card) -> list[str]:
     if "quantized_from" in card:
         precision = "int8"
         made_from = [f"- Quantized from the float32 artifact {card['quantized_from']} (SHA-256) on {', '.join(card['calibration'])}"]
+    if "averaged" in card:
+        average = card["averaged"]
+        share, other = f"{average['share']:.0%}", average["with"]
+        made_from.append(f"- Averaged: {share} of the weights are those of the artifact {other} (SHA-256), from which the run began")
     earlier = [
         f"- Built on: `{run['command']}`, {run['steps']:,} steps in {run['training_seconds'] / 3600:.2f} h" for run in card["before"]
     ]
@@ -81,7 +85,7 @@ def _lines(name: str, scale: int, card: Card) -> list[str]:
         f"- Trained on: {', '.join(card['footage']['train'])}",
         f"- Held out while training: {', '.join(card['footage']['validate'])}",
         "",
-        f"The first frames of the held-out scenes, PSNR-Y in dB{', before it was quantized' if made_from else ''}:",
+        f"The first frames of the held-out scenes, PSNR-Y in dB{', before that' if made_from else ''}:",
         "",
         "| scene and input | bicubic | this model | gain |",
         "|---|---|---|---|",

@@ -1,4 +1,4 @@
-"""gamesr-train, gamesr-export, gamesr-verify and gamesr-evaluate: weights from footage, artifacts from weights, figures from both."""
+"""gamesr-train, gamesr-verify and gamesr-evaluate: weights from footage, and figures from both."""
 
 from __future__ import annotations
 
@@ -16,20 +16,16 @@ from tqdm import tqdm
 
 from client.artifact import load_session
 from client.errors import GamesrError, InputError, ModelError
-from client.models import WEIGHTS
 from client.runtime import PROVIDERS
 from client.upscaler import OnnxUpscaler
 from client.video import read_frames
-from model.artifact_files import new_artifacts
 from model.artifact_weights import network_of_artifact
-from model.cards import card_page, training_card
 from model.catalogue import NAMES
 from model.evaluate import evaluate, table
-from model.export import BASELINES, export_baseline, export_network
 from model.footage import Degradation, FootageCache, load_scenes
 from model.losses import LOSSES
 from model.stability import CASES, CLIP_FRAMES, HEADER, run_cases, table_row
-from model.train import TrainConfig, Trainer, load_checkpoint, network_of
+from model.train import TrainConfig, Trainer
 from model.trial import SHOWN_STEPS, Subject, bounds_of, broken_by
 from model.verify import PARITY_HEADER, StepError, crop, parity, parity_row, parse_size
 
@@ -126,38 +122,6 @@ def train_main(argv: Sequence[str] | None = None) -> int:
         trainer.run(validate_every=arguments.validate_every, progress=sys.stderr.isatty())
 
     return run_command(parser, arguments, work, f"stopped; the same command goes on from the last checkpoint in {arguments.run}")
-
-
-def export_main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="gamesr-export",
-        description="Write a trained network, with its model card beside it, or a baseline, as a self-describing ONNX artifact.",
-        epilog="examples:\n  gamesr-export runs/mine_x2/checkpoint.pt mine\n  gamesr-export bicubic my-bicubic",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("weights", help=f"a run's checkpoint.pt; or {', '.join(BASELINES)}, for both scales")
-    parser.add_argument("name", help="the model's name; its files are NAME_xSCALE.onnx and, of a trained network, .md")
-    parser.add_argument("--folder", type=Path, default=WEIGHTS, help="where to (default: %(default)s)")
-    parser.add_argument("--force", action="store_true", help="replace files that exist")
-    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
-    arguments = parser.parse_args(argv)
-
-    def paths_of(*scales: int) -> list[Path]:
-        return new_artifacts(arguments.name, scales, arguments.folder, source=Path(arguments.weights), force=arguments.force)
-
-    def work() -> None:
-        if arguments.weights in BASELINES:
-            for scale, path in zip((2, 3), paths_of(2, 3), strict=True):
-                export_baseline(arguments.weights, scale, path, name=arguments.name)
-                print(path)
-            return
-        checkpoint = load_checkpoint(Path(arguments.weights))
-        network = network_of(checkpoint)
-        (path,) = paths_of(network.scale)
-        export_network(network, path, name=arguments.name, card=training_card(checkpoint), page=card_page)
-        print(path)
-
-    return run_command(parser, arguments, work, "stopped")
 
 
 def verify_main(argv: Sequence[str] | None = None) -> int:

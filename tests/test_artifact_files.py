@@ -12,7 +12,7 @@ from client import models
 from client.errors import OutputError
 from client.upscaler import OnnxUpscaler
 from model.artifact_files import new_artifacts, write_artifact
-from model.cli import export_main
+from model.export_cli import main as export_main
 from model.quantize_cli import main as quantize_main
 from tests.conftest import tiny_model
 
@@ -46,7 +46,7 @@ def idle(monkeypatch: pytest.MonkeyPatch) -> None:
     def work(*_: object, **__: object) -> None:
         pytest.fail("the work has begun")
 
-    monkeypatch.setattr("model.cli.export_baseline", work)
+    monkeypatch.setattr("model.export_cli.export_baseline", work)
     monkeypatch.setattr("model.quantize_cli.quantize", work)
 
 

@@ -11,7 +11,8 @@ import pytest
 
 from client.models import find_model
 from client.upscaler import OnnxUpscaler
-from model.cli import evaluate_main, export_main, train_main, verify_main
+from model.cli import evaluate_main, train_main, verify_main
+from model.export_cli import main as export_main
 from model.verify import PARITY_HEADER, StepError
 from tests.moving import write_footage
 
@@ -49,6 +50,25 @@ def test_a_card_names_the_runs_that_a_run_was_built_on(workshop: Path) -> None:
     assert "- Built on: `gamesr-train FOOTAGE.toml RUN --degradations area --steps 4 " in page
     assert "--initial-weights run/checkpoint.pt`" in page
     assert str(workshop) not in page
+
+
+def test_a_card_says_what_the_weights_were_averaged_with(workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    into, run, tiny = ["--folder", str(tmp_path)], str(workshop / "run" / "checkpoint.pt"), workshop / "tiny_x2.onnx"
+    assert export_main([run, "between", *into, "--average", str(tiny), "0.25"]) == 0
+    spec = OnnxUpscaler(tiny, threads=1).spec
+    assert OnnxUpscaler(tmp_path / "between_x2.onnx", threads=1).spec.card["averaged"] == {"with": spec.sha256, "share": 0.25}
+    assert f"- Averaged: 25% of the weights are those of the artifact {spec.sha256} (SHA-256)" in (tmp_path / "between_x2.md").read_text()
+    capsys.readouterr()
+    for average, sentence in (
+        ((run, tiny, "a fifth"), "a share from 0 to 1, not 'a fifth'"),
+        ((run, tiny, "1"), "it lies between 0 and 1"),
+        ((run, find_model("live", 2), "0.5"), "is another network than the checkpoint's"),
+        (("bicubic", tiny, "0.5"), "bicubic has no weights to be averaged"),
+    ):
+        weights, artifact, share = average
+        assert export_main([str(weights), "other", *into, "--average", str(artifact), share]) == 1
+        assert sentence in capsys.readouterr().err
+    assert not list(tmp_path.glob("other*"))
 
 
 def test_a_baseline_has_the_name_that_it_is_given_and_no_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

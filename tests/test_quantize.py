@@ -17,8 +17,9 @@ from client.frames import Frame
 from client.upscaler import OnnxUpscaler
 from model import hard_cases
 from model.calibration import even_channels, mean_difference, observed
-from model.cli import export_main, train_main, verify_main
+from model.cli import train_main, verify_main
 from model.export import export_baseline, export_network
+from model.export_cli import main as export_main
 from model.lean import Lean, LeanConfig
 from model.network import GameSR, NetworkConfig
 from model.planes import Network
@@ -275,7 +276,7 @@ def test_from_a_checkpoint_to_a_verified_int8_artifact(tmp_path: Path, capsys: p
     assert (
         f"- Quantized from the float32 artifact {sha256} (SHA-256) on clip.mkv (12 frames), clip.mkv (12 frames), made lines" in page
     )  # all there are
-    assert "in training), int8; " in page and "before it was quantized" in page
+    assert "in training), int8; " in page and "PSNR-Y in dB, before that:" in page
 
     quantized = str(tmp_path / "tiny-int8_x2.onnx")
     check = [quantized, clip, "--steps", "4", "--crop", "48x32"]
