@@ -68,6 +68,7 @@ def _lines(name: str, scale: int, card: Card) -> list[str]:
         average = card["averaged"]
         share, other = f"{average['share']:.0%}", average["with"]
         made_from.append(f"- Averaged: {share} of the weights are those of the artifact {other} (SHA-256), from which the run began")
+    changed = " and ".join(done for key, done in (("averaged", "averaged"), ("quantized_from", "quantized")) if key in card)
     earlier = [
         f"- Built on: `{run['command']}`, {run['steps']:,} steps in {run['training_seconds'] / 3600:.2f} h" for run in card["before"]
     ]
@@ -85,7 +86,7 @@ def _lines(name: str, scale: int, card: Card) -> list[str]:
         f"- Trained on: {', '.join(card['footage']['train'])}",
         f"- Held out while training: {', '.join(card['footage']['validate'])}",
         "",
-        f"The first frames of the held-out scenes, PSNR-Y in dB{', before that' if made_from else ''}:",
+        f"The first frames of the held-out scenes, PSNR-Y in dB{changed and f', before it was {changed}'}:",
         "",
         "| scene and input | bicubic | this model | gain |",
         "|---|---|---|---|",

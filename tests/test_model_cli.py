@@ -57,7 +57,9 @@ def test_a_card_says_what_the_weights_were_averaged_with(workshop: Path, tmp_pat
     assert export_main([run, "between", *into, "--average", str(tiny), "0.25"]) == 0
     spec = OnnxUpscaler(tiny, threads=1).spec
     assert OnnxUpscaler(tmp_path / "between_x2.onnx", threads=1).spec.card["averaged"] == {"with": spec.sha256, "share": 0.25}
-    assert f"- Averaged: 25% of the weights are those of the artifact {spec.sha256} (SHA-256)" in (tmp_path / "between_x2.md").read_text()
+    page = (tmp_path / "between_x2.md").read_text()
+    assert f"- Averaged: 25% of the weights are those of the artifact {spec.sha256} (SHA-256)" in page
+    assert "PSNR-Y in dB, before it was averaged:" in page
     capsys.readouterr()
     for average, sentence in (
         ((run, tiny, "a fifth"), "a share from 0 to 1, not 'a fifth'"),

@@ -276,7 +276,7 @@ def test_from_a_checkpoint_to_a_verified_int8_artifact(tmp_path: Path, capsys: p
     assert (
         f"- Quantized from the float32 artifact {sha256} (SHA-256) on clip.mkv (12 frames), clip.mkv (12 frames), made lines" in page
     )  # all there are
-    assert "in training), int8; " in page and "PSNR-Y in dB, before that:" in page
+    assert "in training), int8; " in page and "PSNR-Y in dB, before it was quantized:" in page
 
     quantized = str(tmp_path / "tiny-int8_x2.onnx")
     check = [quantized, clip, "--steps", "4", "--crop", "48x32"]
