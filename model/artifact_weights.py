@@ -17,6 +17,11 @@ from model.planes import Network
 RUN = ("command", "steps", "training_seconds")  # what a card says of a run that another is built on
 
 
+def averaging(card: dict[str, Any]) -> str:
+    """What a card's `averaged` says, in words."""
+    return f"{card['share']:.0%} of the weights are those of the artifact {card['with']} (SHA-256), from which the run began"
+
+
 def network_of_artifact(artifact: Path, weights: Path | None = None) -> Network:
     """The fused network in float64 with an artifact's weights; raises ModelError when the artifact is not the network that it says.
 
@@ -61,6 +66,8 @@ def run_of_artifact(artifact: Path) -> dict[str, Any]:
     network = described_network(card["network"])
     network.load_deployed(deployed)
     runs = [*card.get("before", ()), {name: card[name] for name in RUN if name in card}]
+    if "averaged" in card:
+        runs.append({"command": averaging(card["averaged"]), "steps": 0, "training_seconds": 0})
     return {
         "network": network.state_dict(),
         "before": [run for run in runs if run.keys() == set(RUN)],

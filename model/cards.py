@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from client.errors import ModelError
+from model.artifact_weights import averaging
 from model.train import TrainConfig
 
 Card = dict[str, Any]
@@ -65,9 +66,7 @@ def _lines(name: str, scale: int, card: Card) -> list[str]:
         precision = "int8"
         made_from = [f"- Quantized from the float32 artifact {card['quantized_from']} (SHA-256) on {', '.join(card['calibration'])}"]
     if "averaged" in card:
-        average = card["averaged"]
-        share, other = f"{average['share']:.0%}", average["with"]
-        made_from.append(f"- Averaged: {share} of the weights are those of the artifact {other} (SHA-256), from which the run began")
+        made_from.append(f"- Averaged: {averaging(card['averaged'])}")
     changed = " and ".join(done for key, done in (("averaged", "averaged"), ("quantized_from", "quantized")) if key in card)
     earlier = [
         f"- Built on: `{run['command']}`, {run['steps']:,} steps in {run['training_seconds'] / 3600:.2f} h" for run in card["before"]

@@ -58,7 +58,10 @@ def test_a_run_goes_on_from_an_artifact_that_ships(name: str, footage: Path, tmp
     plain = Trainer(TrainConfig(**{**TINY.__dict__, "preset": preset, "learning_rate": 1e-4}), footage, cache, tmp_path / "plain")
     assert next(trainer.losses()) < next(plain.losses())
     card = OnnxUpscaler(artifact, threads=1).spec.card
-    assert [run["command"] for run in trainer.before] == [*(run["command"] for run in card["before"]), card["command"]]
+    commands = [*(run["command"] for run in card["before"]), card["command"]]
+    if "averaged" in card:
+        commands.append(f"20% of the weights are those of the artifact {card['averaged']['with']} (SHA-256), from which the run began")
+    assert [run["command"] for run in trainer.before] == commands
     began = network_of_preset(preset, 2)
     began.load_state_dict(run_of_artifact(artifact)["network"])
     moved = [not torch.equal(now, described) for now, described in zip(trainer.network.parameters(), began.parameters(), strict=True)]
