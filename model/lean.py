@@ -49,7 +49,11 @@ class LeanConfig:
         return self.channels - CELL * self.carried
 
 
-LEAN: dict[str, dict[str, int]] = {"fast": {"channels": 16, "blocks": 1, "carried": False}, "live": {}, "balanced": {"blocks": 6}}
+LEAN: dict[str, dict[str, int]] = {
+    "fast": {"channels": 16, "blocks": 1, "carried": False},
+    "live": {},
+    "balanced": {"channels": 48, "blocks": 1},
+}
 
 
 class LeanBlock(nn.Module):

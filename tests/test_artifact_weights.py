@@ -15,6 +15,7 @@ from model.catalogue import network_of_preset
 from model.complexity import parameter_count
 from model.export import export_baseline, export_network
 from model.footage import FootageCache
+from model.lean import Lean, LeanConfig
 from model.train import TrainConfig, Trainer
 from tests.moving import write_footage
 from tests.networks import random_clip, random_network
@@ -69,11 +70,12 @@ def test_a_run_goes_on_from_an_artifact_that_ships(name: str, footage: Path, tmp
 
 
 def test_blocks_that_the_artifact_does_not_have_begin_as_nothing(footage: Path, tmp_path: Path) -> None:
-    artifact = find_model("live", 2)
-    config = TrainConfig(**{**TINY.__dict__, "preset": "balanced", "initial_weights": str(artifact)})
+    artifact = tmp_path / "shallow.onnx"
+    export_network(Lean(LeanConfig(blocks=0)), artifact, name="shallow", card={})
+    config = TrainConfig(**{**TINY.__dict__, "preset": "live", "initial_weights": str(artifact)})
     deeper = Trainer(config, footage, FootageCache(tmp_path / "cache"), tmp_path / "run").network
-    assert torch.equal(deeper.head.weight, run_of_artifact(artifact)["network"]["head.weight"])
-    assert [bool(block.conv.compress.weight.any()) for block in deeper.blocks] == [True, True, False, False, False, False]
+    assert torch.equal(deeper.stem.weight, run_of_artifact(artifact)["network"]["stem.weight"])
+    assert [bool(block.conv.compress.weight.any()) for block in deeper.blocks] == [False, False]
 
 
 def test_an_artifact_without_weights_to_train_is_refused(footage: Path, tmp_path: Path) -> None:
