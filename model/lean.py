@@ -37,7 +37,7 @@ class LeanConfig:
     scale: Literal[2, 3] = 2
     channels: int = 32
     expanded: int = 64
-    blocks: int = 2
+    blocks: int = 1
     carried: bool = True
 
     def __post_init__(self) -> None:
@@ -49,11 +49,7 @@ class LeanConfig:
         return self.channels - CELL * self.carried
 
 
-LEAN: dict[str, dict[str, int]] = {
-    "fast": {"channels": 16, "blocks": 1, "carried": False},
-    "live": {},
-    "balanced": {"channels": 48, "blocks": 1},
-}
+LEAN: dict[str, dict[str, int]] = {"fast": {"channels": 16, "carried": False}, "live": {}, "balanced": {"channels": 48}}
 
 
 class LeanBlock(nn.Module):

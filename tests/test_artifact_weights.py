@@ -49,10 +49,10 @@ def test_the_training_form_gives_what_the_artifact_gives(preset: str, scale: int
             torch.testing.assert_close(a, b, rtol=0, atol=0.02)  # codes; a rounded kernel may fall to its neighbour in bfloat16
 
 
-@pytest.mark.parametrize("name", ["live", "gamesr"])
+@pytest.mark.parametrize("name", ["quality", "gamesr"])
 def test_a_run_goes_on_from_an_artifact_that_ships(name: str, footage: Path, tmp_path: Path) -> None:
     artifact = find_model(name, 2)
-    preset = {"live": "live", "gamesr": "planes"}[name]
+    preset = {"quality": "planes-static-no-lstm", "gamesr": "planes"}[name]
     config = TrainConfig(**{**TINY.__dict__, "preset": preset, "initial_weights": str(artifact), "learning_rate": 1e-4})
     cache = FootageCache(tmp_path / "cache")
     trainer = Trainer(config, footage, cache, tmp_path / "run")
@@ -75,7 +75,7 @@ def test_blocks_that_the_artifact_does_not_have_begin_as_nothing(footage: Path, 
     config = TrainConfig(**{**TINY.__dict__, "preset": "live", "initial_weights": str(artifact)})
     deeper = Trainer(config, footage, FootageCache(tmp_path / "cache"), tmp_path / "run").network
     assert torch.equal(deeper.stem.weight, run_of_artifact(artifact)["network"]["stem.weight"])
-    assert [bool(block.conv.compress.weight.any()) for block in deeper.blocks] == [False, False]
+    assert [bool(block.conv.compress.weight.any()) for block in deeper.blocks] == [False]
 
 
 def test_an_artifact_without_weights_to_train_is_refused(footage: Path, tmp_path: Path) -> None:
@@ -90,7 +90,7 @@ def test_an_artifact_without_weights_to_train_is_refused(footage: Path, tmp_path
         config = TrainConfig(**{**TINY.__dict__, "initial_weights": str(path)})
         with pytest.raises(GamesrError, match=message):
             Trainer(config, footage, FootageCache(tmp_path / "cache"), tmp_path / "run")
-    for preset in ("fsrcnn", "planes"):
-        config = TrainConfig(**{**TINY.__dict__, "preset": preset, "initial_weights": str(find_model("live", 2))})
-        with pytest.raises(ModelError, match="no weight that fits this network: it is one of --preset live"):
+    for preset in ("fsrcnn", "live"):
+        config = TrainConfig(**{**TINY.__dict__, "preset": preset, "initial_weights": str(find_model("gamesr", 2))})
+        with pytest.raises(ModelError, match="no weight that fits this network: it is one of --preset planes"):
             Trainer(config, footage, FootageCache(tmp_path / "cache"), tmp_path / "run")
