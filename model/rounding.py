@@ -18,11 +18,13 @@ STEPS = 255  # from the smallest to the largest value of a channel
 
 
 class RoundedFeatures:
-    """Noise as wide as a step of 8 bits on what the last block of a `model.lean` network gives, while it is trained.
+    """What the last block of a `model.lean` network gives, rounded to 8 bits while it is trained.
 
     A channel's step follows from its range over the clip and over the made frames that calibration looks at too, and so does
-    its gradient: a network comes to give letters, lines and noise no larger features than footage. That is the noise of DiffQ
-    (Defossez et al. 2021) on features, whose range it leaves to be learned. Raises InputError for any other network.
+    the gradient of the error: a network comes to give letters, lines and noise no larger features than footage (as in LSQ, Esser et al.
+    2020, whose step is learned by itself). Where the codes lie is chance, new for each clip; in a flat area a channel is off by the same
+    everywhere, as it is when it runs, and noise that is new for every sample would not show what that does. Raises InputError for any
+    other network.
     """
 
     def __init__(self, network: Network) -> None:
@@ -45,7 +47,11 @@ class RoundedFeatures:
 
         def rounded(module: nn.Module, inputs: object, features: Tensor) -> Tensor:
             width = torch.maximum(highest, features.amax((0, 2, 3))) - torch.minimum(lowest, features.amin((0, 2, 3)))
-            return features + (torch.rand_like(features) - 0.5) * (width / STEPS)[:, None, None]
+            step = (width / STEPS)[:, None, None]
+            with torch.no_grad():
+                codes = features.float() / step + torch.rand_like(step, dtype=torch.float32)  # bfloat16 holds 8 bits and no phase of them
+                error = torch.where(step > 0, codes.round() - codes, 0)
+            return features + error * step
 
         hook = self._last.register_forward_hook(rounded)
         try:

@@ -37,7 +37,7 @@ def features_of(network: Lean, clip: Planes) -> torch.Tensor:
     return torch.stack(seen)
 
 
-def test_noise_is_at_most_half_a_step_of_the_channels_range_over_clip_and_made_frames(network: Lean) -> None:
+def test_an_error_is_at_most_half_a_step_of_the_channels_range_over_clip_and_made_frames(network: Lean) -> None:
     clip = Planes(*(plane.float() for plane in random_clip(1, 2, 16, 24)))
     rounded = RoundedFeatures(network)
     exact = features_of(network, clip)
@@ -55,6 +55,18 @@ def test_noise_is_at_most_half_a_step_of_the_channels_range_over_clip_and_made_f
     torch.testing.assert_close(features_of(network, clip), exact, rtol=0, atol=0)
 
 
+def test_in_a_flat_area_a_channel_is_off_by_the_same_everywhere_and_by_another_code_in_each_clip(network: Lean) -> None:
+    grey = Planes(*(torch.full(shape, 128.0) for shape in ((1, 2, 1, 16, 24), (1, 2, 1, 8, 12), (1, 2, 1, 8, 12))))
+    exact, rounded = features_of(network, grey), RoundedFeatures(network)
+    errors = []
+    for _ in range(2):
+        with rounded(0):
+            errors.append(features_of(network, grey) - exact)
+    for error in errors:
+        torch.testing.assert_close(error, error[:1, :1, :, :1, :1].expand_as(error), rtol=0, atol=1e-6)
+    assert (errors[0] - errors[1]).abs().amax() > 1e-4
+
+
 def test_what_made_frames_reach_has_a_gradient(network: Lean) -> None:
     """A grey clip alone would leave a kernel of differences without one."""
     grey = Planes(*(torch.full(shape, 128.0) for shape in ((1, 1, 1, 16, 24), (1, 1, 1, 8, 12), (1, 1, 1, 8, 12))))
@@ -68,7 +80,7 @@ def test_what_made_frames_reach_has_a_gradient(network: Lean) -> None:
     assert across.abs().max() > 0
 
 
-def test_an_error_inside_leaves_no_noise_behind(network: Lean) -> None:
+def test_an_error_inside_leaves_nothing_rounded_behind(network: Lean) -> None:
     clip = Planes(*(plane.float() for plane in random_clip(1, 1, 8, 8)))
     exact = features_of(network, clip)
     with pytest.raises(ZeroDivisionError), RoundedFeatures(network)(0):
