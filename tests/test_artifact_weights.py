@@ -59,14 +59,19 @@ def test_a_run_goes_on_from_an_artifact_that_ships(name: str, footage: Path, tmp
     plain = Trainer(TrainConfig(**{**TINY.__dict__, "preset": preset, "learning_rate": 1e-4}), footage, cache, tmp_path / "plain")
     assert next(trainer.losses()) < next(plain.losses())
     card = OnnxUpscaler(artifact, threads=1).spec.card
-    commands = [*(run["command"] for run in card["before"]), card["command"]]
-    if "averaged" in card:
-        commands.append(f"20% of the weights are those of the artifact {card['averaged']['with']} (SHA-256), from which the run began")
-    assert [run["command"] for run in trainer.before] == commands
+    assert [run["command"] for run in trainer.before] == [*(run["command"] for run in card["before"]), card["command"]]
     began = network_of_preset(preset, 2)
     began.load_state_dict(run_of_artifact(artifact)["network"])
     moved = [not torch.equal(now, described) for now, described in zip(trainer.network.parameters(), began.parameters(), strict=True)]
     assert all(moved)
+
+
+def test_that_an_artifact_was_averaged_is_among_what_made_it(tmp_path: Path) -> None:
+    run = {"command": "gamesr-train footage.toml run", "steps": 3, "training_seconds": 1}
+    card = {**run, "averaged": {"with": "abc", "share": 0.2}}
+    export_network(random_network("live", 2), tmp_path / "live.onnx", name="live", card=card)
+    said = "20% of the weights are those of the artifact abc (SHA-256), from which the run began"
+    assert run_of_artifact(tmp_path / "live.onnx")["before"] == [run, {"command": said, "steps": 0, "training_seconds": 0}]
 
 
 def test_blocks_that_the_artifact_does_not_have_begin_as_nothing(footage: Path, tmp_path: Path) -> None:
