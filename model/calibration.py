@@ -21,7 +21,6 @@ Made = tuple[Callable[[int, int, int], Iterator[Frame]], int, int]
 # stripes, as the edges go on): cut off there, lines came out 36 codes wrong.
 MADE: tuple[Made, ...] = ((lines, 160, 96), (text, 160, 96), (noise, 160, 96), (noise, 160, 2), (noise, 2, 96))
 MADE_FRAMES = 16
-KEPT = 0.9  # of what made frames reach: the last tenth widens every step by a twentieth, and cut off it is a few codes in a line
 
 Array = NDArray[np.float64]
 Feeds = dict[str, NDArray[np.generic]]  # what a graph takes, by name
@@ -39,13 +38,12 @@ def observed(model: onnx.ModelProto, tensors: list[str], inputs: Iterable[Feeds]
         yield dict(zip(tensors, session.run(tensors, feeds), strict=True))
 
 
-def even_channels(model: onnx.ModelProto, inputs: Iterable[Feeds], made: Iterable[Feeds] = ()) -> dict[str, tuple[float, int]]:
+def even_channels(model: onnx.ModelProto, inputs: Iterable[Feeds]) -> None:
     """Scale the channels between convolutions that a leaky ReLU joins, in place; the network computes what it did.
 
     A leaky ReLU of t x is t times that of x, for t > 0, so a channel's weights and bias may be multiplied by what the next layer's are
     divided by ("cross-layer equalization", Nagel et al. 2019, section 4.1). Here every channel comes to reach as far as any other over
-    `inputs`, and over `KEPT` of what it reaches in `made` ones: in 8 bits with one step for a tensor those of small values have no use
-    of most of its range. Gives, for each tensor between, the step and the zero point of 8 unsigned bits that cover that.
+    `inputs`: in 8 bits with one step for a tensor those of small values have no use of most of its range.
     """
     convs = {node.output[0]: node for node in model.graph.node if node.op_type == "Conv"}
     readers: dict[str, list[onnx.NodeProto]] = {}
@@ -61,21 +59,14 @@ def even_channels(model: onnx.ModelProto, inputs: Iterable[Feeds], made: Iterabl
     names = [features for _, features, _ in joined]
     lowest: dict[str, Array] = dict.fromkeys(names, np.zeros(1))
     highest = dict(lowest)
-    for share, frames in ((1, inputs), (KEPT, made)):
-        for values in observed(model, names, frames):
-            for name, features in values.items():
-                lowest[name] = np.minimum(lowest[name], share * features.min((0, 2, 3)))
-                highest[name] = np.maximum(highest[name], share * features.max((0, 2, 3)))
+    for values in observed(model, names, inputs):
+        for name, features in values.items():
+            lowest[name] = np.minimum(lowest[name], features.min((0, 2, 3)))
+            highest[name] = np.maximum(highest[name], features.max((0, 2, 3)))
     tensors = {tensor.name: tensor for tensor in model.graph.initializer}
-    steps: dict[str, tuple[float, int]] = {}
     for before, name, behind in joined:
         weights = [numpy_helper.to_array(tensors[conv.input[1]]) for conv in behind]
-        gains = sum(np.square(weight, dtype=np.float64).sum((0, 2, 3)) for weight in weights)
-        reach = _even(lowest[name], highest[name], gains)
-        low, high = (lowest[name] / reach).min(), (highest[name] / reach).max()
-        if high > low:  # not all of them dead
-            step = (high - low) / 255
-            steps[name] = step, round(-low / step)
+        reach = _even(lowest[name], highest[name], sum(np.square(weight, dtype=np.float64).sum((0, 2, 3)) for weight in weights))
         for tensor, factors in (
             (before.input[1], 1 / reach[:, None, None, None]),
             (before.input[2], 1 / reach),
@@ -83,7 +74,6 @@ def even_channels(model: onnx.ModelProto, inputs: Iterable[Feeds], made: Iterabl
         ):
             scaled = (numpy_helper.to_array(tensors[tensor]) * factors).astype(np.float32)
             tensors[tensor].CopyFrom(numpy_helper.from_array(scaled, tensor))
-    return steps
 
 
 def mean_difference(model: onnx.ModelProto, other: onnx.ModelProto, tensor: str, inputs: Iterable[Feeds]) -> Array:

@@ -46,10 +46,10 @@ def quantize(
     """Write an int8 artifact, whose card says what it was made from and calibrated on; `page` makes what lies beside it.
 
     `clips` are videos of the artifact's input, low resolution and compressed as they will be; the ranges of the features are
-    the smallest and the largest value in the first `frames` frames of each, and `KEPT` of those in `MADE_FRAMES` frames of each of
-    `MADE`. Weights are symmetric, a scale for each output channel, features unsigned with one scale and zero point for a tensor (signed
-    ones take twice as long in both runtimes), of which every channel is made to use all (`even_channels`). What 8 bits do to the mean of
-    the clips' pictures is taken back in a `model.lean` network. Raises ModelError for an artifact that is not a float32 network of
+    the smallest and the largest value in the first `frames` frames of each, and in `MADE_FRAMES` frames of each of `MADE`. Weights
+    are symmetric, a scale for each output channel, features unsigned with one scale and zero point for a tensor (signed ones take
+    twice as long in both runtimes), of which every channel is made to use all (`even_channels`). What 8 bits do to the mean of the
+    clips' pictures is taken back in a `model.lean` network. Raises ModelError for an artifact that is not a float32 network of
     ours and InputError for a clip without frames.
     """
     _, spec = load_session(artifact, "cpu", 1)
@@ -62,9 +62,7 @@ def quantize(
     left_float = [*residuals, *(node.input[0] for node in model.graph.node if node.op_type == "LeakyRelu")]
     metadata = {entry.key: entry.value for entry in onnx.load(artifact).metadata_props}
     footage = _Footage(spec, clips, frames, MADE)
-    steps = even_channels(model, _Footage(spec, clips, frames), _Footage(spec, (), 0, MADE))
-    if residuals:
-        steps |= _codes(model.graph)
+    even_channels(model, footage)
     with tempfile.TemporaryDirectory(prefix="gamesr-quantize-") as folder:
         whole = Path(folder) / "int8.onnx"
         with _quiet_quantizer():
@@ -77,7 +75,7 @@ def quantize(
                 per_channel=True,
                 activation_type=QuantType.QUInt8,
                 weight_type=QuantType.QInt8,
-                extra_options={"TensorQuantOverrides": {tensor: [_parameters(*step)] for tensor, step in steps.items()}},
+                extra_options={"TensorQuantOverrides": _exact_codes(model.graph) if residuals else {}},
             )
         quantized = onnx.load(whole)
     for tensor in left_float:
@@ -176,14 +174,10 @@ def with_cells_apart(artifact: Path) -> tuple[onnx.ModelProto, dict[str, str]]:
     return model, {head.output[0]: head.input[1].replace("features.weight", "cells.bias") for head in heads}
 
 
-def _codes(graph: onnx.GraphProto) -> dict[str, tuple[float, int]]:
-    """Step and zero point of the codes about zero that the first convolution reads: each has a number of its own."""
-    return {next(node for node in graph.node if node.op_type == "Conv").input[0]: (1.0, MIDDLE)}
-
-
-def _parameters(step: float, zero: int) -> dict[str, Any]:
-    """Those of a tensor as the quantizer is told of them."""
-    return {"scale": np.array(step, np.float32), "zero_point": np.array(zero, np.uint8)}
+def _exact_codes(graph: onnx.GraphProto) -> dict[str, list[dict[str, Any]]]:
+    """What the quantizer is told of the codes about zero that the first convolution reads: each has a number of its own."""
+    codes = next(node for node in graph.node if node.op_type == "Conv").input[0]
+    return {codes: [{"scale": np.array(1, np.float32), "zero_point": np.array(MIDDLE, np.uint8)}]}
 
 
 def leave_float(graph: onnx.GraphProto, tensor: str) -> None:
