@@ -141,7 +141,8 @@ class Trainer:
         fitting = {name: value for name, value in earlier["network"].items() if name in own and own[name].shape == value.shape}
         first = next(name for name, layer in self.network.named_modules() if isinstance(layer, nn.Conv2d))
         if f"{first}.weight" not in fitting:  # a layer inside fits many a network
-            raise ModelError(f"{path} has no weight that fits this network: it is one of {f'--preset {preset}' if preset else 'no preset'}")
+            of = f"--preset {preset}" if preset else "no preset"
+            raise ModelError(f"{path} has no weight that fits this network: it is one of {of}")
         self.network.load_state_dict({**own, **fitting})
 
     def save(self) -> None:
