@@ -252,6 +252,8 @@ def evaluate_main(argv: Sequence[str] | None = None) -> int:
             measured.append(row)
             if arguments.json:
                 print(json.dumps(row), flush=True)
+        if not measured:
+            raise InputError(f"no scene of {arguments.footage} was rendered for {' or '.join(arguments.degradations)}")
         if not arguments.json:
             print(table(measured))
 

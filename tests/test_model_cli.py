@@ -144,6 +144,14 @@ def test_evaluate_refuses_two_models_of_one_name(workshop: Path, capsys: pytest.
     assert not (workshop / "names.jsonl").exists()
 
 
+def test_evaluate_says_when_no_scene_was_rendered_for_that(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    footage = workshop / "footage.toml"
+    command = [str(footage), "--cache", str(workshop / "cache"), "--rows", str(workshop / "native.jsonl"), "--scales", "2"]
+    assert evaluate_main([*command, "--degradations", "native@8000", "--models", "bicubic"]) == 1
+    said = capsys.readouterr()
+    assert (said.out, said.err) == ("", f"gamesr-evaluate: no scene of {footage} was rendered for native@8000\n")
+
+
 def test_an_artifact_named_twice_is_measured_once(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = [str(workshop / "footage.toml"), "--cache", str(workshop / "cache"), "--rows", str(workshop / "twice.jsonl"), "--scales", "2"]
     names = ["bicubic", str(find_model("bicubic", 2))]
