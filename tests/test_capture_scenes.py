@@ -54,6 +54,7 @@ def test_a_scene_says_of_itself_what_its_game_does_not(tmp_path: Path) -> None:
     assert [shot.name for shot in shots_of(one, [108, 216])] == ["216p", "108p"]
     assert [shot.name for shot in shots_of(two, [108, 216])] == ["216p", "108p", "216p_aa"]
     assert [shot.name for shot in shots_of(replace(two, native=False), [108, 216])] == ["216p", "216p_aa"]
+    assert [shot.name for shot in shots_of(two, [216])] == ["216p"]  # nothing small to be held against the other
 
 
 def test_what_is_filmed_decides_the_digest_and_nothing_else(tmp_path: Path) -> None:

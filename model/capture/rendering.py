@@ -48,10 +48,13 @@ Event = FramesDone | SceneDone | SceneFailed
 
 
 def shots_of(scene: SceneSpec, heights: Sequence[int]) -> list[Shot]:
-    """What is filmed of a scene: the reference, lower resolutions where they show the same, a supersampled one where asked for."""
+    """What is filmed of a scene: the reference, lower resolutions where they show the same, a supersampled one where it has one.
+
+    The last costs four times what the reference does, and is what small renders are held against: with no smaller height it is left out.
+    """
     reference, *lower = sorted(heights, reverse=True)
     shots = [Shot(reference), *(Shot(height) for height in lower if scene.native)]
-    return [*shots, Shot(reference, SUPERSAMPLE)] if scene.antialiased else shots
+    return [*shots, Shot(reference, SUPERSAMPLE)] if scene.antialiased and lower else shots
 
 
 def render(scenes: Sequence[SceneSpec], library: Library, heights: Sequence[int], *, jobs: int, timeout_s: float) -> Iterator[Event]:
