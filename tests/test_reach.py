@@ -50,10 +50,9 @@ def test_every_shipped_model_says_it() -> None:
     interpolations = {"bicubic": 4, "lanczos": 6, "easu": 6, "fsr1": 6}
     networks = {"fast": 6, "live": 6, "balanced": 6, "quality": 14, "gamesr": 16, "gamesr-paper": 20}
     in_int8 = {f"{name}-int8": networks[name] for name in ("fast", "live", "balanced")}
-    by_3 = {"balanced_x3": 16, "balanced-int8_x3": 16}  # of six blocks
     assert {path.stem: load_session(path, "cpu", 1)[1].reach for path in shipped_models()} == {
         f"{name}_x{scale}": pixels for name, pixels in {**interpolations, **networks, **in_int8}.items() for scale in (2, 3)
-    } | by_3
+    }
 
 
 @pytest.mark.parametrize("reach", ["-2", "3", "4096", "far"])
