@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,13 @@ import onnx
 import torch
 from onnx import numpy_helper
 
-from client.artifact import load_session
+from client.artifact import ModelSpec, load_session
 from client.errors import ModelError
+from client.models import shipped_models
 from model.catalogue import described_network, preset_of
 from model.planes import Network
 
+ORIGINALS = Path(__file__).parent / "originals"  # float32 artifacts that only int8 ones were made from
 RUN = ("command", "steps", "training_seconds")  # what a card says of a run that another is built on
 
 
@@ -25,7 +28,7 @@ def averaging(card: dict[str, Any]) -> str:
 def network_of_artifact(artifact: Path, weights: Path | None = None) -> Network:
     """The fused network in float64 with an artifact's weights; raises ModelError when the artifact is not the network that it says.
 
-    The weights of an int8 artifact are those of the float32 artifact that it was made from, `weights`.
+    The weights of an int8 artifact are those of the float32 artifact that it was made from: `weights`, or one that ships.
     """
     _, spec = load_session(artifact, "cpu", 1)
     if "network" not in spec.card:
@@ -33,7 +36,9 @@ def network_of_artifact(artifact: Path, weights: Path | None = None) -> Network:
     if weights is not None and load_session(weights, "cpu", 1)[1].sha256 != spec.card.get("quantized_from"):
         raise ModelError(f"{artifact} was not made from {weights}")
     if weights is None and spec.precision == "int8":
-        raise ModelError(f"{artifact} has rounded weights: name the float32 artifact that it was made from with --weights")
+        weights = _original(spec)
+        if weights is None:
+            raise ModelError(f"{artifact} has rounded weights: name the float32 artifact that it was made from with --weights")
     network = described_network(spec.card["network"]).deployed()
     side = spec.size_multiple
     remembered = [(1, part.channels, side // part.divisor, side // part.divisor) for part in spec.state]
@@ -51,6 +56,12 @@ def network_of_artifact(artifact: Path, weights: Path | None = None) -> Network:
     except (TypeError, ValueError) as error:
         raise ModelError(f"{artifact} has other weights than the network that it says it is") from error
     return network.double().eval()
+
+
+def _original(spec: ModelSpec) -> Path | None:
+    """The float32 artifact that ships and that an int8 one says it was made from."""
+    of = spec.card.get("quantized_from")
+    return next((path for path in (*ORIGINALS.glob("*.onnx"), *shipped_models()) if sha256(path.read_bytes()).hexdigest() == of), None)
 
 
 def run_of_artifact(artifact: Path) -> dict[str, Any]:

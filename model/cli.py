@@ -37,6 +37,9 @@ folder and goes on where it stopped when the same command is given again:
   gamesr-train footage.toml runs/paper_x3 --preset paper --scale 3 --device cuda
   gamesr-train my_game.toml runs/my_live_x2 --preset live --initial-weights client/weights/live_x2.onnx --learning-rate 0.0003
   gamesr-train my_game.toml runs/my_fast_x2 --preset fast --initial-weights client/weights/fast_x2.onnx --learning-rate 0.0003 --int8
+  gamesr-train my_game.toml runs/my_wide_x2 --preset live-wide --initial-weights client/weights/live_x2.onnx --int8
+
+live-wide and balanced-wide are what 8 bits run in as much time as live and balanced; they go on from the weights of those too.
 """
 
 VERIFY_EXAMPLES = """\
@@ -151,7 +154,7 @@ def verify_main(argv: Sequence[str] | None = None) -> int:
         help=f"what runs the artifact, of {', '.join(PROVIDERS)}; of the hard cases one, else any number beside each other (default: cpu)",
     )
     parser.add_argument(
-        "--weights", type=Path, metavar="FLOAT32", help="the .onnx artifact that an int8 one was made from: the reference's"
+        "--weights", type=Path, metavar="FLOAT32", help="the .onnx artifact that an int8 one was made from, where that does not ship"
     )
     parser.add_argument("--json", action="store_true", help="a JSON line a step and provider, or a hard case, instead of the table")
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")

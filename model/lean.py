@@ -7,7 +7,7 @@ their weights. A network so narrow that the cells would be a third of its layers
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Literal, Self, cast
 
@@ -31,7 +31,7 @@ class LeanConfig:
     """Everything that decides the network's shape.
 
     `channels` is the width of what runs: features and, where they are `carried`, the six samples of a cell. AMX computes 32 in one go,
-    AVX512 16, whatever part of them is used.
+    AVX512 16, whatever part of them is used. In 8 bits no layer carries the cells, and the wide forms have features in their place.
     """
 
     scale: Literal[2, 3] = 2
@@ -49,7 +49,13 @@ class LeanConfig:
         return self.channels - CELL * self.carried
 
 
-LEAN: dict[str, dict[str, int]] = {"fast": {"channels": 16, "carried": False}, "live": {}, "balanced": {"channels": 48}}
+LEAN: dict[str, dict[str, int]] = {
+    "fast": {"channels": 16, "carried": False},
+    "live": {},
+    "live-wide": {"carried": False},
+    "balanced": {"channels": 48},
+    "balanced-wide": {"channels": 48, "carried": False},
+}
 
 
 class LeanBlock(nn.Module):
@@ -200,6 +206,22 @@ class Lean(Network):
         network = Lean(replace(self.config, channels=self.config.features, carried=False))
         network.load_state_dict(self.state_dict())
         return network
+
+    def widened(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The weights of a narrower network of as many blocks, in training form, as weights of this one, which gives the same with them.
+
+        What further features it has are as they were drawn, and nothing reads them yet. The head of another scale is left out.
+        """
+        wide = {}
+        for name, own in self.state_dict().items():
+            given = weights[name]
+            grows = name.startswith(("stem.", "blocks.")) or len(given) == len(own)
+            if grows and all(few <= many for few, many in zip(given.shape, own.shape, strict=True)):
+                wide[name] = own.clone()
+                if own.dim() > 1:
+                    wide[name][:, given.shape[1] :] = 0
+                wide[name][tuple(map(slice, given.shape))] = given
+        return wide
 
     @property
     def _gain_of_a_middle(self) -> float:

@@ -22,6 +22,7 @@ from client.errors import InputError, ModelError
 from model.artifact_weights import run_of_artifact
 from model.catalogue import NAMES, described_network, network_of_preset
 from model.footage import Degradation, FootageCache, Pair, by_game, load_pairs, load_scenes, sample_clips
+from model.lean import Lean
 from model.losses import LOSSES, charbonnier, mean_log_mse
 from model.planes import Network, Planes, State
 from model.rounding import RoundedFeatures
@@ -129,7 +130,10 @@ class Trainer:
         self.step, self.seconds, self.held_out = saved["step"], saved["seconds"], saved["held_out"]
 
     def _start_from(self, path: Path) -> None:
-        """Take over every weight of the same name and shape; a network of another scale keeps its own head and base."""
+        """Take over every weight of the same name and shape; a network of another scale keeps its own head and base.
+
+        A `model.lean` network takes those of a narrower one too.
+        """
         if path.suffix == ".onnx":
             earlier = run_of_artifact(path)
             preset, self.before = earlier["preset"], earlier["before"]
@@ -137,8 +141,10 @@ class Trainer:
             earlier = load_checkpoint(path)
             preset = earlier["config"]["preset"]
             self.before = [*earlier["before"], {"config": earlier["config"], "step": earlier["step"], "seconds": earlier["seconds"]}]
-        own = self.network.state_dict()
-        fitting = {name: value for name, value in earlier["network"].items() if name in own and own[name].shape == value.shape}
+        own, weights = self.network.state_dict(), earlier["network"]
+        if isinstance(self.network, Lean) and weights.keys() == own.keys():
+            weights = self.network.widened(weights)
+        fitting = {name: value for name, value in weights.items() if name in own and own[name].shape == value.shape}
         first = next(name for name, layer in self.network.named_modules() if isinstance(layer, nn.Conv2d))
         if f"{first}.weight" not in fitting:  # a layer inside fits many a network
             of = f"--preset {preset}" if preset else "no preset"

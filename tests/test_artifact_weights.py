@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 from pathlib import Path
 
 import pytest
@@ -87,6 +88,25 @@ def test_blocks_that_the_artifact_does_not_have_begin_as_nothing(footage: Path, 
     assert [bool(block.conv.compress.weight.any()) for block in deeper.blocks] == [False]
 
 
+@pytest.mark.parametrize("scale", [2, 3])
+def test_a_wide_network_begins_as_the_narrow_one_and_learns_to_use_its_width(scale: int, footage: Path, tmp_path: Path) -> None:
+    """All features beyond the artifact's are drawn and unread; another scale keeps its own head and base, as ever."""
+    artifact, cache = find_model("live", scale), FootageCache(tmp_path / "cache")
+    given = {**TINY.__dict__, "preset": "live-wide", "initial_weights": str(artifact)}
+    trainer = Trainer(TrainConfig(**{**given, "scale": scale}), footage, cache, tmp_path / "same")
+    clip = random_clip(1, 3, 24, 40)
+    expected, _ = network_of_artifact(artifact)(clip)
+    found, _ = copy.deepcopy(trainer.network).double()(clip)
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=0.02)  # codes
+    narrow = LeanConfig().features
+    assert trainer.network.stem.weight[narrow:].any() and not trainer.network.head.weight[:, narrow:].any()
+    list(itertools.islice(trainer.losses(), 2))
+    assert trainer.network.head.weight[:, narrow:].any() and trainer.network.blocks[0].conv.expand.weight[:, narrow:].any()
+    other = Trainer(TrainConfig(**{**given, "scale": 5 - scale}), footage, cache, tmp_path / "other").network
+    assert torch.equal(other.stem.weight[:narrow], run_of_artifact(artifact)["network"]["stem.weight"]) and not other.head.weight.any()
+
+
 def test_an_artifact_without_weights_to_train_is_refused(footage: Path, tmp_path: Path) -> None:
     export_baseline("bicubic", 2, tmp_path / "bicubic.onnx", name="bicubic")
     (tmp_path / "foreign.onnx").write_bytes(b"no model at all")
@@ -99,6 +119,9 @@ def test_an_artifact_without_weights_to_train_is_refused(footage: Path, tmp_path
         config = TrainConfig(**{**TINY.__dict__, "initial_weights": str(path)})
         with pytest.raises(GamesrError, match=message):
             Trainer(config, footage, FootageCache(tmp_path / "cache"), tmp_path / "run")
+    wider = TrainConfig(**{**TINY.__dict__, "preset": "live", "initial_weights": str(find_model("balanced", 2))})
+    with pytest.raises(ModelError, match="no weight that fits this network: it is one of --preset balanced"):
+        Trainer(wider, footage, FootageCache(tmp_path / "cache"), tmp_path / "run")
     for preset in ("fsrcnn", "live"):
         config = TrainConfig(**{**TINY.__dict__, "preset": preset, "initial_weights": str(find_model("gamesr", 2))})
         with pytest.raises(ModelError, match="no weight that fits this network: it is one of --preset planes"):

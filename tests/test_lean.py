@@ -24,8 +24,10 @@ BFLOAT16_EXACT = 256  # integers up to this
         ("fast", 2, 44_028, 7_976),
         ("live", 2, 48_028, 17_944),
         ("live", 3, 55_843, 26_614),
+        ("live-wide", 2, 50_428, 19_240),
         ("balanced", 2, 54_428, 33_816),
         ("balanced", 3, 66_563, 46_806),
+        ("balanced-wide", 2, 56_828, 35_112),
     ],
 )
 def test_parameter_counts(preset: str, scale: int, training: int, running: int) -> None:
