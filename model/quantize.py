@@ -41,12 +41,19 @@ JOINING = ("Relu", "Add")
 
 
 def quantize(
-    artifact: Path, path: Path, clips: Sequence[Path], *, name: str, frames: int = CALIBRATION_FRAMES, page: Page | None = None
+    artifact: Path,
+    path: Path,
+    clips: Sequence[Path],
+    *,
+    name: str,
+    frames: int = CALIBRATION_FRAMES,
+    made_frames: int = MADE_FRAMES,
+    page: Page | None = None,
 ) -> None:
     """Write an int8 artifact, whose card says what it was made from and calibrated on; `page` makes what lies beside it.
 
     `clips` are videos of the artifact's input, low resolution and compressed as they will be; the ranges of the features are
-    the smallest and the largest value in the first `frames` frames of each, and in `MADE_FRAMES` frames of each of `MADE`. Weights
+    the smallest and the largest value in the first `frames` frames of each, and in `made_frames` frames of each of `MADE`. Weights
     are symmetric, a scale for each output channel, features unsigned with one scale and zero point for a tensor (signed ones take
     twice as long in both runtimes), of which every channel is made to use all (`even_channels`). What 8 bits do to the mean of the
     clips' pictures is taken back in a `model.lean` network. Raises ModelError for an artifact that is not a float32 network of
@@ -61,7 +68,7 @@ def quantize(
         raise ModelError(f"{artifact} has no layer that is quantized: it is no GameSR network")
     left_float = [*residuals, *(node.input[0] for node in model.graph.node if node.op_type == "LeakyRelu")]
     metadata = {entry.key: entry.value for entry in onnx.load(artifact).metadata_props}
-    footage = _Footage(spec, clips, frames, MADE)
+    footage = _Footage(spec, clips, frames, MADE, made_frames)
     even_channels(model, footage)
     with tempfile.TemporaryDirectory(prefix="gamesr-quantize-") as folder:
         whole = Path(folder) / "int8.onnx"
@@ -99,9 +106,9 @@ class _Footage(CalibrationDataReader):  # type: ignore[misc]
     `played` says which clips are through, and how many of their frames that were.
     """
 
-    def __init__(self, spec: ModelSpec, clips: Sequence[Path], most: int, made: Sequence[Made] = ()) -> None:
+    def __init__(self, spec: ModelSpec, clips: Sequence[Path], most: int, made: Sequence[Made] = (), made_frames: int = 0) -> None:
         self.played: list[str] = []
-        self._spec, self._clips, self._most, self._made = spec, clips, most, made
+        self._spec, self._clips, self._most, self._made, self._made_frames = spec, clips, most, made, made_frames
         self._inputs = iter(self)
 
     def get_next(self) -> Feeds | None:
@@ -119,9 +126,9 @@ class _Footage(CalibrationDataReader):  # type: ignore[misc]
                 raise InputError(f"no frame of {clip} could be decoded")
             self.played.append(f"{clip.name} ({count} frames)")
         for made, width, height in self._made:
-            for frame in made(width, height, MADE_FRAMES):
+            for frame in made(width, height, self._made_frames):
                 yield _feeds(frame, self._spec)
-            self.played.append(f"made {made.__name__}, {width}x{height} ({MADE_FRAMES} frames)")
+            self.played.append(f"made {made.__name__}, {width}x{height} ({self._made_frames} frames)")
 
 
 def _feeds(frame: Frame, spec: ModelSpec) -> Feeds:

@@ -10,6 +10,7 @@ from client.errors import InputError
 from client.models import WEIGHTS
 from client.upscaler import OnnxUpscaler
 from model.artifact_files import new_artifacts
+from model.calibration import MADE_FRAMES
 from model.cards import card_page
 from model.cli import run_command
 from model.quantize import CALIBRATION_FRAMES, quantize
@@ -19,10 +20,10 @@ example:
   gamesr-quantize client/weights/live_x2.onnx mine-int8 match_540p.mp4 race_540p.mp4
 
 The clips are what the artifact will be given: low resolution, compressed, of several scenes, none of them a test scene.
-fast-int8, live-int8 and balanced-int8 ship, made like this. How much is lost and gained, and where: docs/stability.md. To see it for
-a model of your own:
+fast-int8, live-int8 and balanced-int8 ship, made like this, the last two of model/originals. How much is lost and gained, and where:
+docs/stability.md. To see it for a model of your own:
 
-  gamesr-verify client/weights/mine-int8_x2.onnx test_540p.mp4 --weights client/weights/live_x2.onnx --provider cpu openvino
+  gamesr-verify client/weights/mine-int8_x2.onnx test_540p.mp4 --provider cpu openvino
   gamesr-evaluate FOOTAGE.toml --models live mine-int8 --scales 2
   gamesr-bench --model live --model mine-int8 --provider openvino
 """
@@ -40,17 +41,32 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("name", help="the new model's name; its files are NAME_xSCALE.onnx and .md")
     parser.add_argument("clips", type=Path, nargs="+", metavar="clip", help="low-resolution videos of several scenes")
     parser.add_argument("--frames", type=int, default=CALIBRATION_FRAMES, help="of each clip, from its start (default: %(default)s)")
+    parser.add_argument(
+        "--made-frames",
+        type=int,
+        default=MADE_FRAMES,
+        help="of each kind of made picture (letters, lines, noise): with more, noise comes out nearer and a flat sky not as near "
+        "(default: %(default)s)",
+    )
     parser.add_argument("--folder", type=Path, default=WEIGHTS, help="where to (default: %(default)s)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     arguments = parser.parse_args(argv)
 
     def work() -> None:
-        if arguments.frames < 1:
-            raise InputError("--frames must be 1 or more")
+        if arguments.frames < 1 or arguments.made_frames < 1:
+            raise InputError("--frames and --made-frames must be 1 or more")
         scale = OnnxUpscaler(arguments.model, threads=1).spec.scale
         (path,) = new_artifacts(arguments.name, [scale], arguments.folder, source=arguments.model, force=arguments.force)
-        quantize(arguments.model, path, arguments.clips, name=arguments.name, frames=arguments.frames, page=card_page)
+        quantize(
+            arguments.model,
+            path,
+            arguments.clips,
+            name=arguments.name,
+            frames=arguments.frames,
+            made_frames=arguments.made_frames,
+            page=card_page,
+        )
         print(path)
 
     return run_command(parser, arguments, work, "stopped")

@@ -287,6 +287,11 @@ def test_from_a_checkpoint_to_a_verified_int8_artifact(tmp_path: Path, capsys: p
     assert "with --weights" in capsys.readouterr().err
     assert verify_main([*check, "--weights", quantized]) == 1
     assert "was not made from" in capsys.readouterr().err
-    assert main([model, "tiny-int8", clip, "--frames", "0", *into]) == 1
+    assert main([model, "wider-int8", clip, "--made-frames", "40", *into]) == 0
+    assert "made noise, 2x96 (40 frames)" in (tmp_path / "wider-int8_x2.md").read_text()
+    capsys.readouterr()
+    for option in ("--frames", "--made-frames"):
+        assert main([model, "tiny-int8", clip, option, "0", *into]) == 1
+        assert capsys.readouterr().err == "gamesr-quantize: --frames and --made-frames must be 1 or more\n"
     assert main([quantized, "twice", clip, *into]) == 1
     assert capsys.readouterr().err.endswith("is int8 already: quantize the float32 artifact\n")
