@@ -92,7 +92,9 @@ def train_main(argv: Sequence[str] | None = None) -> int:
         help="charbonnier, the paper's, sums errors up; psnr their logarithms by clip and plane (default: %(default)s)",
     )
     parser.add_argument("--bfloat16", action="store_true", help="mixed precision: about twice as fast on AMX CPUs and on GPUs")
-    parser.add_argument("--int8", action="store_true", help="train for 8 bits: their rounding is part of the error (fast, live, balanced)")
+    parser.add_argument(
+        "--int8", action="store_true", help="train for 8 bits: their rounding is part of the error (fast, live, balanced, wide or not)"
+    )
     parser.add_argument(
         "--initial-weights",
         default="",

@@ -29,7 +29,7 @@ class RoundedFeatures:
 
     def __init__(self, network: Network) -> None:
         if not isinstance(network, Lean) or not network.blocks:
-            raise InputError("only fast, live and balanced can be trained for 8 bits")
+            raise InputError("only fast, live and balanced, wide or not, can be trained for 8 bits")
         self._network, self._last = network, network.blocks[-1]
         made = [[_planes(frame, network.weight.device) for frame in make(width, height, MADE_FRAMES)] for make, width, height in MADE]
         self._made = list(zip(*made, strict=True))

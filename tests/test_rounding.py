@@ -90,7 +90,7 @@ def test_an_error_inside_leaves_nothing_rounded_behind(network: Lean) -> None:
 
 @pytest.mark.parametrize("preset", ["planes", "paper", "srvgg"])
 def test_a_network_without_such_features_is_refused(preset: str) -> None:
-    with pytest.raises(InputError, match="only fast, live and balanced can be trained for 8 bits"):
+    with pytest.raises(InputError, match="only fast, live and balanced, wide or not, can be trained for 8 bits"):
         RoundedFeatures(random_network(preset))
 
 

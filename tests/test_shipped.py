@@ -25,7 +25,7 @@ from model.verify import crop, parity
 REFERENCE = Path(__file__).parent / "footage" / "oa_koth1_1080p.mp4"
 UNTRAINED, NETWORKS = ("bicubic", "lanczos", "easu", "fsr1"), ("gamesr", "gamesr-paper", "quality", "balanced", "live", "fast")
 IN_INT8 = ("balanced", "live", "fast")
-TIERS = ("fast", "live", "balanced", "quality", "gamesr", "fast-int8", "live-int8")
+TIERS = ("fast", "live", "balanced", "quality", "gamesr", "fast-int8", "live-int8", "balanced-int8")
 STEPS = {"noise": 6, "still": 140, "sizes": 2}
 NEEDS_BFLOAT16 = pytest.mark.skipif(
     "BF16" not in openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES"), reason="this processor does not compute in bfloat16"
