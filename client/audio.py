@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
@@ -14,30 +15,42 @@ from client.errors import OutputError
 from client.video import open_local
 
 
-class AudioCopy:
-    """Every audio stream of `path`, added to `output` and then copied along as its video advances.
+@dataclass(frozen=True)
+class _Span:
+    begin: int
+    end: int
 
-    It reads the file a second time, by itself: whatever drives the video need not know that there is audio. Raises
-    OutputError for a codec that the container of `output` cannot hold.
+
+class AudioCopy:
+    """Every audio stream of `path`, added to `output`, whose header it writes, and then copied along as its video advances.
+
+    It reads the file a second time, by itself: whatever drives the video need not know that there is audio. A packet whose time
+    does not go on from the one before follows it at once, as pictures do; `moved` counts them. Raises OutputError for audio that the
+    container of `output` cannot hold.
     """
 
     def __init__(self, path: Path, output: OutputContainer) -> None:
+        self.moved = 0
         self._container = open_local(path)
         self._output = output
         self._targets: dict[int, AudioStream] = {}
-        for stream in self._container.streams.audio:
-            try:
-                self._targets[stream.index] = output.add_stream_from_template(stream)
-            except ValueError as error:
-                self._container.close()
-                raise OutputError(f"{output.format.name} cannot hold the audio of {path} ({stream.name}): write to .mkv instead") from error
+        self._last: dict[int, _Span] = {}  # where each stream's last packet lies
+        try:
+            for stream in self._container.streams.audio:
+                self._targets[stream.index] = _added(output, stream)
+            output.start_encoding()
+        except ValueError as error:  # FFmpeg's "Invalid argument" is one too
+            names = ", ".join(stream.name for stream in self._container.streams.audio)
+            self._container.close()
+            matroska = output.format.name == "matroska"
+            advice = f"leave it out with ffmpeg -i {path} -c copy -an, and upscale that" if matroska else "write to .mkv instead"
+            raise OutputError(f"{output.format.name} cannot hold the audio of {path} ({names}): {advice}") from error
         self._packets = self._read()
         self._waiting = next(self._packets, None)
 
     def copy_until(self, time: Fraction | None) -> None:
         """Copy the packets that begin before `time` in seconds, or all that are left."""
         while self._waiting is not None and (time is None or _seconds(self._waiting) < time):
-            self._waiting.stream = self._targets[self._waiting.stream_index]
             self._output.mux_one(self._waiting)
             self._waiting = next(self._packets, None)
 
@@ -54,7 +67,30 @@ class AudioCopy:
             except (StopIteration, av.FFmpegError):  # a file that is cut short ends its audio where it ends its video
                 return
             if packet.size and packet.dts is not None:
+                self._retime(packet, packet.dts)
                 yield packet
+
+    def _retime(self, packet: av.Packet[AudioStream], dts: int) -> None:
+        """Put it into the target's ticks, in which each packet has to begin later than the one before."""
+        target = self._targets[packet.stream_index]
+        ticks = packet.time_base / target.time_base
+        begin, last = round(dts * ticks), self._last.get(packet.stream_index)
+        if last is not None and begin <= last.begin:
+            begin = last.end
+            self.moved += 1
+        delay = 0 if packet.pts is None else round((packet.pts - dts) * ticks)
+        duration = round((packet.duration or 0) * ticks)
+        self._last[packet.stream_index] = _Span(begin, begin + max(1, duration))
+        packet.stream, packet.time_base = target, target.time_base
+        packet.dts, packet.pts, packet.duration = begin, begin + delay, duration
+
+
+def _added(output: OutputContainer, stream: AudioStream) -> AudioStream:
+    target = output.add_stream_from_template(stream)
+    channels = stream.codec_context.channels
+    if stream.codec_context.layout.name == f"{channels} channels":  # of .avi and .mkv, which do not say which is which
+        target.codec_context.layout = f"{channels}c"  # FFmpeg's word for the usual ones
+    return target
 
 
 def _seconds(packet: av.Packet[AudioStream]) -> Fraction:

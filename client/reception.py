@@ -58,8 +58,8 @@ class Reception:
     """Follows one sender: its packets in order, its pictures whole as soon as their marker bit is there, judged by the loss rule.
 
     It locks to the first address and SSRC that sends two packets in sequence (RFC 3550, A.1), and ignores others until that
-    one has said goodbye or been silent for a second. From the same address, two packets in sequence with another SSRC, or far away in
-    sequence, are a sender that was started again. Every buffer is bounded; nothing that is received raises.
+    one has said goodbye or been silent for a second. From the same address, two packets in sequence with another SSRC, far away in
+    sequence, or behind a goodbye by more than packets overtake each other, are a sender that was started again. Every buffer is bounded; nothing that is received raises.
 
     All times are `time.perf_counter_ns()`, given by the caller.
     """
@@ -75,6 +75,7 @@ class Reception:
         self._counts = ReceptionCounts()
         self.sender: Address | None = None
         self.ended = False  # the sender said goodbye
+        self._ended_ns = 0  # when it did
         self.heard_ns = 0  # when the sender's newest packet came
         self._begun_ns = 0  # when the first packet of all came
         self._payload_type, self._extensions = payload_type, extensions_map(send_time_id)
@@ -110,7 +111,8 @@ class Reception:
             self._counts.ignored += 1
             return []
         number = unwrap(packet.sequence_number, self._newest, 16)
-        if (address, packet.ssrc) == (self.sender, self._ssrc) and -_MAX_MISORDER < number - self._newest < _MAX_DROPOUT:
+        gone = self.ended and now_ns - self._ended_ns > WAIT_NS
+        if (address, packet.ssrc) == (self.sender, self._ssrc) and not gone and -_MAX_MISORDER < number - self._newest < _MAX_DROPOUT:
             return self._accept(number, packet, len(datagram), now_ns)
         return self._consider(packet, len(datagram), address, now_ns)
 
@@ -150,7 +152,7 @@ class Reception:
         if address != self.sender:
             self._counts.ignored += 1
         elif any(isinstance(packet, RtcpByePacket) and self._ssrc in packet.sources for packet in parse_rtcp(datagram)):
-            self.ended = True
+            self.ended, self._ended_ns = True, now_ns
             # Nothing follows that could fill a gap, or tell that the last picture's end is missing.
             units = self._assemble(self._order.release(now_ns + WAIT_NS), now_ns)
             return units + [self._judged(unit, now_ns) for unit in self._assembler.end()]

@@ -144,6 +144,8 @@ class _Encoding:
             )
         if self._moved_pts:
             notes.append(f"{self._moved_pts} frames had no timestamp or one that went back: theirs follow from the frame rate")
+        if self._audio.moved:
+            notes.append(f"{self._audio.moved} packets of sound had a timestamp that went back: each follows the one before")
         return notes
 
     def _add_video(self, source: VideoSource, first: Frame) -> VideoStream:

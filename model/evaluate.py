@@ -19,7 +19,7 @@ from client.video import Decoded
 from model.footage import Degradation, FootageCache, Pair, Scene, load_pairs
 
 Row = dict[str, Any]
-_KEY = ("clip", "scale", "model", "sha256", "frames", "provider")
+_KEY = ("clip", "footage", "scale", "model", "sha256", "frames", "provider")
 
 
 def evaluate(
@@ -39,8 +39,8 @@ def evaluate(
     Rows are told apart by the model's name, so two artifacts of one name are refused, and an artifact named twice has one row.
 
     Speed is not measured here but by gamesr-bench, so rows may be made while something else runs. A row is known by clip,
-    scale, number of frames, provider and the artifact's digest; what its card says of parameters and multiply-accumulates stands
-    in the row too. Raises what reading footage and models raises.
+    its footage's digest, scale, number of frames, provider and the artifact's digest; what its card says of parameters and
+    multiply-accumulates stands in the row too. Raises what reading footage and models raises.
     """
     known = _read_rows(store)
     upscalers = {scale: _upscalers([find_model(name, scale) for name in models], provider, threads) for scale in scales}
@@ -49,7 +49,7 @@ def evaluate(
             for pair in takes:
                 for upscaler in upscalers[scale]:
                     spec = upscaler.spec
-                    values = pair.title, scale, spec.name, spec.sha256, min(frames, len(pair)), provider
+                    values = pair.title, pair.low.digest, scale, spec.name, spec.sha256, min(frames, len(pair)), provider
                     key = dict(zip(_KEY, values, strict=True))
                     row = known.get(json.dumps(key))
                     if row is None:
@@ -92,7 +92,7 @@ def _read_rows(store: Path) -> dict[str, Row]:
                 row = json.loads(line)
                 rows[json.dumps({k: row[k] for k in _KEY})] = row
             except (ValueError, KeyError) as error:
-                raise InputError(f"{store} is not a file of rows made by gamesr-evaluate: {error}") from error
+                raise InputError(f"{store} is not a file of rows as this gamesr-evaluate makes them: {error}") from error
     return rows
 
 

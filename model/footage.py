@@ -110,9 +110,13 @@ class Degradation:
 
 @dataclass(frozen=True)
 class Take:
-    """Decoded frames in a memory-mapped array: uint8 (frames, 3*H/2, W), each frame as I420."""
+    """Decoded frames in a memory-mapped array: uint8 (frames, 3*H/2, W), each frame as I420.
+
+    `digest` is of all that they come from: the films' contents, the scale and the encoder's settings.
+    """
 
     data: NDArray[np.uint8]
+    digest: str
 
     def __len__(self) -> int:
         return len(self.data)
@@ -173,8 +177,8 @@ class FootageCache:
         return self._take(key, frames)
 
     def _take(self, key: dict[str, object], frames: Callable[[], Iterable[Frame]]) -> Take:
-        name = hashlib.sha256(json.dumps([CACHE_VERSION, key], sort_keys=True).encode()).hexdigest()[:24]
-        path = self.folder / f"{name}.npy"
+        digest = hashlib.sha256(json.dumps([CACHE_VERSION, key], sort_keys=True).encode()).hexdigest()[:24]
+        path = self.folder / f"{digest}.npy"
         if not path.exists():
             rows = [np.concatenate([plane.reshape(-1) for plane in (f.y, f.u, f.v)]).reshape(-1, f.width) for f in frames()]
             if not rows:
@@ -182,7 +186,7 @@ class FootageCache:
             partial = path.with_suffix(f".{os.getpid()}.npy")
             np.save(partial, np.stack(rows))
             partial.replace(path)
-        return Take(np.load(path, mmap_mode="c"))  # torch warns of arrays that it could not write to
+        return Take(np.load(path, mmap_mode="c"), digest)  # torch warns of arrays that it could not write to
 
 
 def _target(scene: Scene, antialiased: bool) -> Path:

@@ -156,7 +156,7 @@ def make_clip(tmp_path: Path) -> Callable[..., Path]:
                 context.sample_aspect_ratio = sample_aspect_ratio
             if rotation is not None:
                 stream.set_display_rotation(rotation)
-            sound = container.add_stream(audio, rate=48000, format="fltp") if audio else None
+            sound = container.add_stream(audio, rate=48000, format="s16" if "pcm" in audio else "fltp") if audio else None
             for index in range(frames):
                 frame = to_av_frame(pictures[index]) if pictures else picture(index, width, height, pix_fmt)
                 frame.pts, frame.time_base = (pts[index] if pts else index), Fraction(1, FPS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
+from itertools import pairwise, product
 from pathlib import Path
 
 import av
@@ -126,10 +127,39 @@ def test_audio_is_copied_untouched(make_clip: MakeClip, upscaler: OnnxUpscaler, 
     assert all(abs(b - a - shift) <= tolerance for (_, a), (_, b) in zip(before, after, strict=True))
 
 
-def test_audio_that_the_container_cannot_hold_is_refused(make_clip: MakeClip, upscaler: OnnxUpscaler, tmp_path: Path) -> None:
-    clip = make_clip("clip.mkv", audio="wavpack")
-    with pytest.raises(OutputError, match="cannot hold the audio"):
-        through(clip, upscaler, tmp_path / "out.mp4")
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_sound_follows_on_where_the_time_goes_back(make_clip: MakeClip, upscaler: OnnxUpscaler, tmp_path: Path, suffix: str) -> None:
+    """Two recordings in one transport stream."""
+    clip, output = make_clip("clip.ts", audio="aac"), tmp_path / f"out.{suffix}"
+    once = audio_packets(clip)
+    clip.write_bytes(2 * clip.read_bytes())
+    with VideoSource(clip) as source, FileSink(output, source) as sink:
+        assert len(list(upscale_stream(source, upscaler, sink))) == 2 * FRAMES
+    after = audio_packets(output)
+    assert len(after) == 2 * len(once) > 20 and all(b > a for (_, a), (_, b) in pairwise(after))
+    assert abs(after[-1][1] - after[0][1] - (len(after) - 1) * Fraction(1024, 48000)) <= Fraction(2, 1000)
+    assert f"{len(once)} packets of sound had a timestamp that went back: each follows the one before" in sink.notes
+
+
+@pytest.mark.parametrize(("name", "suffix"), list(product(["clip.avi", "clip.mkv"], ["mp4", "mkv"])))
+def test_pcm_without_a_channel_layout_is_copied(make_clip: MakeClip, upscaler: OnnxUpscaler, tmp_path: Path, name: str, suffix: str) -> None:
+    clip, output = make_clip(name, audio="pcm_s16le"), tmp_path / f"out.{suffix}"
+    with av.open(str(clip)) as container:
+        assert container.streams.audio[0].layout.name == "2 channels"
+    through(clip, upscaler, output)
+    assert b"".join(data for data, _ in audio_packets(output)) == b"".join(data for data, _ in audio_packets(clip))
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "suffix", "advice"),
+    [("clip.mkv", "wavpack", "mp4", "write to .mkv instead"), ("clip.avi", "adpcm_ms", "mkv", "leave it out with ffmpeg -i .*clip.avi -c copy -an")],
+)
+def test_audio_that_the_container_cannot_hold_is_refused(
+    make_clip: MakeClip, upscaler: OnnxUpscaler, tmp_path: Path, name: str, codec: str, suffix: str, advice: str
+) -> None:
+    clip = make_clip(name, audio=codec)
+    with pytest.raises(OutputError, match=rf"cannot hold the audio of .*{name} \({codec}\): {advice}"):
+        through(clip, upscaler, tmp_path / f"out.{suffix}")
     assert not list(tmp_path.glob("*out*"))
 
 

@@ -213,6 +213,22 @@ def test_goodbye_is_believed_of_the_sender_alone() -> None:
     assert reception.ended
 
 
+def test_a_stream_that_goes_on_behind_its_goodbye_is_taken_up_again_but_stragglers_are_not() -> None:
+    """Whoever can write a sender's address can say goodbye in its name."""
+    stream, reception = RtpStream(), Reception(wall_offset_ns=0)
+    heard(reception, packets(stream, 0, 5), MS)
+    stragglers = packets(stream, 1)
+    reception.take(stream.goodbye(), HERE, 100 * MS)
+    for datagram in stragglers:
+        reception.take(datagram, HERE, 101 * MS)
+    assert reception.ended and reception.counts.senders == 1 and reception.feedback(101 * MS) is None
+    units = [whole for datagram in packets(stream, 2) for whole in reception.take(datagram, HERE, 133 * MS)]
+    assert not reception.ended and reception.counts.senders == 2
+    assert [(whole.restarted, whole.damaged) for whole in units] == [(True, True)]
+    assert reception.feedback(134 * MS) is not None  # it asks for a key frame
+    assert reception.take(stream.goodbye(), HERE, 140 * MS) == [] and reception.ended
+
+
 @pytest.mark.parametrize("gone", [1, 2], ids=["in-the-middle", "with-the-marker"])
 def test_what_waits_at_the_goodbye_is_not_lost(gone: int) -> None:
     """Nothing can fill a gap any more, and a picture whose last packet is missing is damaged."""
