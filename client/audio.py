@@ -17,8 +17,10 @@ from client.video import open_local
 
 @dataclass(frozen=True)
 class _Span:
-    begin: int
-    end: int
+    """Of one packet, in seconds."""
+
+    begin: Fraction
+    end: Fraction
 
 
 class AudioCopy:
@@ -40,7 +42,7 @@ class AudioCopy:
                 self._targets[stream.index] = _added(output, stream)
             output.start_encoding()
         except ValueError as error:  # FFmpeg's "Invalid argument" is one too
-            names = ", ".join(stream.name for stream in self._container.streams.audio)
+            names = ", ".join(stream.name or "unknown" for stream in self._container.streams.audio)
             self._container.close()
             matroska = output.format.name == "matroska"
             advice = f"leave it out with ffmpeg -i {path} -c copy -an, and upscale that" if matroska else "write to .mkv instead"
@@ -72,17 +74,20 @@ class AudioCopy:
 
     def _retime(self, packet: av.Packet[AudioStream], dts: int) -> None:
         """Put it into the target's ticks, in which each packet has to begin later than the one before."""
-        target = self._targets[packet.stream_index]
-        ticks = packet.time_base / target.time_base
-        begin, last = round(dts * ticks), self._last.get(packet.stream_index)
-        if last is not None and begin <= last.begin:
+        target, index = self._targets[packet.stream_index], packet.stream_index
+        tick = target.time_base
+        assert tick is not None  # the header has been written
+        begin, last = dts * packet.time_base, self._last.get(index)
+        if last is not None and round(begin / tick) <= round(last.begin / tick):
             begin = last.end
             self.moved += 1
-        delay = 0 if packet.pts is None else round((packet.pts - dts) * ticks)
-        duration = round((packet.duration or 0) * ticks)
-        self._last[packet.stream_index] = _Span(begin, begin + max(1, duration))
-        packet.stream, packet.time_base = target, target.time_base
-        packet.dts, packet.pts, packet.duration = begin, begin + delay, duration
+        delay = None if packet.pts is None else (packet.pts - dts) * packet.time_base
+        duration = (packet.duration or 0) * packet.time_base
+        # Exact: Matroska's ticks are of a millisecond, and what is lost to them in each packet would add up.
+        self._last[index] = _Span(begin, begin + max(tick, duration))
+        packet.stream, packet.time_base = target, tick
+        packet.dts, packet.duration = round(begin / tick), round(duration / tick)
+        packet.pts = None if delay is None else round((begin + delay) / tick)
 
 
 def _added(output: OutputContainer, stream: AudioStream) -> AudioStream:

@@ -59,7 +59,8 @@ class Reception:
 
     It locks to the first address and SSRC that sends two packets in sequence (RFC 3550, A.1), and ignores others until that
     one has said goodbye or been silent for a second. From the same address, two packets in sequence with another SSRC, far away in
-    sequence, or behind a goodbye by more than packets overtake each other, are a sender that was started again. Every buffer is bounded; nothing that is received raises.
+    sequence, or behind a goodbye by more than packets overtake each other, are a sender that was started again. Every buffer is
+    bounded; nothing that is received raises.
 
     All times are `time.perf_counter_ns()`, given by the caller.
     """

@@ -142,7 +142,9 @@ def test_sound_follows_on_where_the_time_goes_back(make_clip: MakeClip, upscaler
 
 
 @pytest.mark.parametrize(("name", "suffix"), list(product(["clip.avi", "clip.mkv"], ["mp4", "mkv"])))
-def test_pcm_without_a_channel_layout_is_copied(make_clip: MakeClip, upscaler: OnnxUpscaler, tmp_path: Path, name: str, suffix: str) -> None:
+def test_pcm_without_a_channel_layout_is_copied(
+    make_clip: MakeClip, upscaler: OnnxUpscaler, tmp_path: Path, name: str, suffix: str
+) -> None:
     clip, output = make_clip(name, audio="pcm_s16le"), tmp_path / f"out.{suffix}"
     with av.open(str(clip)) as container:
         assert container.streams.audio[0].layout.name == "2 channels"
@@ -152,7 +154,10 @@ def test_pcm_without_a_channel_layout_is_copied(make_clip: MakeClip, upscaler: O
 
 @pytest.mark.parametrize(
     ("name", "codec", "suffix", "advice"),
-    [("clip.mkv", "wavpack", "mp4", "write to .mkv instead"), ("clip.avi", "adpcm_ms", "mkv", "leave it out with ffmpeg -i .*clip.avi -c copy -an")],
+    [
+        ("clip.mkv", "wavpack", "mp4", "write to .mkv instead"),
+        ("clip.avi", "adpcm_ms", "mkv", "leave it out with ffmpeg -i .*clip.avi -c copy -an"),
+    ],
 )
 def test_audio_that_the_container_cannot_hold_is_refused(
     make_clip: MakeClip, upscaler: OnnxUpscaler, tmp_path: Path, name: str, codec: str, suffix: str, advice: str
