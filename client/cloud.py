@@ -63,8 +63,9 @@ def area_scale(name: str, size: tuple[int, int], height: int) -> int:
 
 def _luma_mean(plane: Plane, scale: int) -> Plane:
     height, width = plane.shape
-    total = plane.reshape(height // scale, scale, width).sum(1, dtype=np.uint16)
-    return _round_divide(total.reshape(height // scale, width // scale, scale).sum(2, dtype=np.uint16), scale * scale)
+    total_type = np.uint16 if scale <= 16 else np.uint32  # the narrow one holds 257 samples, and is twice as fast
+    total = plane.reshape(height // scale, scale, width).sum(1, dtype=total_type)
+    return _round_divide(total.reshape(height // scale, width // scale, scale).sum(2, dtype=total_type), scale * scale)
 
 
 def _chroma_mean(plane: Plane, scale: int) -> Plane:

@@ -9,10 +9,10 @@ from pathlib import Path
 from client.errors import InputError
 from client.video import VideoSource
 from server.job import content_sha256
+from server.rate import whole_rate
 
 SCALES = (2, 3)
 PARTS = {1: "whole", 2: "half", 3: "third"}
-_RATE_TOLERANCE = 0.002  # 59.94 is 60, 23.976 is 24
 
 
 @dataclass(frozen=True)
@@ -28,12 +28,9 @@ class Clip:
 
     @classmethod
     def read(cls, path: Path) -> Clip:
-        """Open the file and hash it; raises InputError for what cannot be read, or not at a whole rate."""
+        """Open the file and hash it; raises InputError for what cannot be read, or not at a whole and constant rate."""
         with VideoSource(path) as source:
-            rate = float(source.frame_rate)
-            fps = round(rate)
-            if not fps or abs(rate / fps - 1) > _RATE_TOLERANCE:
-                raise InputError(f"{path} has {rate:.4g} frames a second, which is not a whole number: convert it first")
+            fps, _ = whole_rate(source)
             return cls(path, content_sha256(path), source.width, source.height, fps, source.announced_frames)
 
     def divides(self, scale: int) -> bool:

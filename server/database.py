@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from client.errors import OutputError
+from server.wal import write_ahead
 
 _BUSY_S = 10.0
 _APPLICATION_ID = 0x67616D73  # "gams"
@@ -63,7 +64,7 @@ class Database:
     def _connection(self) -> Iterator[sqlite3.Connection]:
         try:
             with closing(sqlite3.connect(self.path, timeout=_BUSY_S, isolation_level=None)) as connection:
-                connection.execute("PRAGMA journal_mode = WAL")
+                write_ahead(connection, _BUSY_S)
                 connection.execute("PRAGMA synchronous = NORMAL")
                 yield connection
         except sqlite3.Error as error:

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import hashlib
 import hmac
+import ipaddress
 from typing import Annotated
 from urllib.parse import urlsplit
 
@@ -18,7 +19,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from server.settings import Limits
 
 KEY_HEADER = "X-API-Key"
-LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 UPLOAD_PATH = "/api/v1/clips"
 _CHANGING = ("POST", "PUT", "PATCH", "DELETE")
 _HEADERS = {
@@ -47,6 +47,14 @@ def same_key(given: str, wanted: str) -> bool:
     """Compared in constant time, as digests, so that not even the length shows."""
     digests = [hashlib.sha256(key.encode()).digest() for key in (given, wanted)]
     return hmac.compare_digest(*digests)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a name or an address can mean nothing but this machine."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 class Guards:
@@ -80,10 +88,10 @@ class Guards:
 
     def _refusal(self, method: str, headers: Headers) -> str | None:
         host = headers.get("host", "")
-        if self._loopback and _hostname(host) not in LOOPBACK_NAMES:
+        if self._loopback and not is_loopback(_hostname(host)):
             return "this service is for its own machine: use 127.0.0.1 or localhost"
         origin, site = headers.get("origin"), headers.get("sec-fetch-site", "none")
-        if method in _CHANGING and (site not in ("none", "same-origin") or (origin is not None and urlsplit(origin).netloc != host)):
+        if method in _CHANGING and (site not in ("none", "same-origin") or (origin is not None and _netloc(origin) != host)):
             return "a page of another origin may not do this"
         return None
 
@@ -145,3 +153,11 @@ def _hostname(host: str) -> str:
         return urlsplit(f"//{host}").hostname or ""
     except ValueError:
         return ""
+
+
+def _netloc(origin: str) -> str | None:
+    """Of a browser's word for where a page comes from; None for what is no address, and so no host of ours."""
+    try:
+        return urlsplit(origin).netloc
+    except ValueError:
+        return None

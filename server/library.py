@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import os
 import re
 import secrets
 import threading
@@ -64,7 +65,7 @@ class Library:
             status = path.stat()
         except OSError:
             return None
-        stamp = f"{status.st_size} {status.st_mtime_ns}"
+        stamp = _stamp(status)
         row = self._row(name, stamp)
         if row is None:
             with _LOOKED_AT:
@@ -78,11 +79,15 @@ class Library:
         return self._files().get(name)
 
     def known_names(self) -> dict[str, str]:
-        """By sha256, the clips that have been looked at; waits a moment for those that are just being looked at."""
+        """By sha256, the clips that have been looked at, uploads before the folder's; waits a moment for those that are being looked at."""
         self._looked.wait(_LOOK_S)
-        there = self._files()
-        rows = self._database.rows("SELECT name, known FROM clips WHERE known IS NOT NULL")
-        return {str(json.loads(known)["sha256"]): str(name) for name, known in rows if name in there}
+        there = {}
+        for name, path in self._files().items():
+            with contextlib.suppress(OSError):
+                there[name] = _stamp(path.stat())
+        rows = self._database.rows("SELECT name, stamp, known FROM clips WHERE known IS NOT NULL")
+        rows.sort(key=lambda row: str(row[0]).startswith(UPLOADED))
+        return {str(json.loads(known)["sha256"]): str(name) for name, stamp, known in rows if there.get(name) == stamp}
 
     def uploads(self) -> int:
         return sum(name.startswith(UPLOADED) for name in self._files())
@@ -99,8 +104,7 @@ class Library:
             name = f"{UPLOADED}{secrets.token_hex(8)}{suffix}"
             path = self._settings.uploads / name
             uploaded.rename(path)
-            status = path.stat()
-            self._remember(name, f"{status.st_size} {status.st_mtime_ns}", title or name, known, None)
+            self._remember(name, _stamp(path.stat()), title or name, known, None)
         clip = self.clip(name)
         if clip is None:
             raise OutputError(f"{name} went away while it was kept")
@@ -151,6 +155,10 @@ class Library:
 def low_heights(width: int, height: int) -> list[int]:
     """The whole, half and third of a height that 4:2:0 can hold at that scale."""
     return [height // scale for scale in (1, *SCALES) if width % (2 * scale) == 0 and height % (2 * scale) == 0]
+
+
+def _stamp(status: os.stat_result) -> str:
+    return f"{status.st_size} {status.st_mtime_ns}"
 
 
 def _usable(folder: Path | None) -> Iterator[Path]:

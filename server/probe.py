@@ -18,15 +18,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from client.errors import InputError
+from server.rate import whole_rate
 from server.settings import Limits
 
-_RATE_TOLERANCE = 0.002
 _FILES = 64
 
 
 @dataclass(frozen=True)
 class Known:
-    """`fps` is the rate as a whole number; `frames` were counted where the clip was decoded whole, else as the file announces."""
+    """`fps` is the rate as a whole number; `frames` are those that were decoded where the clip was decoded whole, else its packets."""
 
     sha256: str
     width: int
@@ -94,11 +94,9 @@ def _look(task: _Task) -> Known:
 
     path = Path(task.path)
     with VideoSource(path) as source:
-        width, height, rate = source.width, source.height, float(source.frame_rate)
-        fps = round(rate)
-        if not fps or abs(rate / fps - 1) > _RATE_TOLERANCE:
-            raise InputError(f"the clip has {rate:.4g} frames a second, which is not a whole number: convert it first")
-        frames = source.estimated_frames or 0
+        fps, frames = whole_rate(source)
+    with VideoSource(path) as source:
+        width, height = source.width, source.height
         if task.whole:
             if width * height > task.clip_pixels:
                 raise InputError(f"the clip is {width}x{height}: a picture may have {task.clip_pixels} pixels")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import ipaddress
 import os
 import shutil
 import signal
@@ -18,7 +17,7 @@ from pathlib import Path
 from types import FrameType
 
 from client.errors import GamesrError, InputError, OutputError
-from server.guards import LOOPBACK_NAMES
+from server.guards import is_loopback
 from server.runner import RunnerProcess, add_folders
 from server.settings import Settings
 
@@ -80,7 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def settings_of(arguments: argparse.Namespace, key: str | None) -> Settings:
     """Raises InputError for what would not be safe."""
-    loopback = _is_loopback(arguments.host)
+    loopback = is_loopback(arguments.host)
     if key is None and not loopback:
         raise InputError(f"on {arguments.host} others could start sweeps: set {KEY_VARIABLE}, or leave out --host")
     if key is not None and (len(key) < LEAST_KEY or not key.isascii() or not key.isprintable()):
@@ -98,6 +97,7 @@ def serve(arguments: argparse.Namespace) -> None:
         import uvicorn
 
         from server.app import create_app  # not above: without its packages the sentence below has to come
+        from server.connections import bounded_protocol
     except ModuleNotFoundError as error:
         raise OutputError(f"the service needs {error.name}: pip install 'gamesr[serve]'") from error
     app = create_app(settings)
@@ -106,7 +106,15 @@ def serve(arguments: argparse.Namespace) -> None:
         with nullcontext() if arguments.no_runner else RunnerProcess(replace(settings, api_key=None)):
             print(f"{PROGRAM}: http://{f'[{host}]' if ':' in host else host}:{port}/", flush=True)
             # No proxy's word is taken for where a request comes from, and open event streams do not hold up the end.
-            config = uvicorn.Config(app, log_level="warning", server_header=False, proxy_headers=False, timeout_graceful_shutdown=2)
+            config = uvicorn.Config(
+                app,
+                http=bounded_protocol(settings.limits),
+                ws="none",
+                log_level="warning",
+                server_header=False,
+                proxy_headers=False,
+                timeout_graceful_shutdown=2,
+            )
             uvicorn.Server(config).run([listener])
 
 
@@ -128,13 +136,6 @@ def _demo(arguments: argparse.Namespace, folder: Path) -> None:
     except OSError as error:
         raise InputError(f"the sample sweep cannot be copied to {folder}: {error.strerror}") from error
     arguments.store, arguments.data, arguments.clips = folder / "sweep.sqlite", folder / "data", DEMO
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host in LOOPBACK_NAMES
 
 
 def _port(text: str) -> int:

@@ -13,7 +13,8 @@ class Limits:
     """What one caller, or all of them together, may take. Uploads are decoded whole, in a process that `decode_*` bound."""
 
     body_bytes: int = 64 * 1024  # of everything but an upload
-    idle_s: float = 10.0  # between two pieces of a body
+    connections_at_once: int = 256
+    idle_s: float = 10.0  # between two pieces of a body, and for the head of a request
     upload_bytes: int = 512 * MIB
     upload_s: float = 600.0
     uploads_at_once: int = 2

@@ -16,6 +16,7 @@ from typing import Self
 from client.errors import OutputError
 from server.asked import AskedSweep
 from server.points import LatencyResult, PointResult
+from server.wal import write_ahead
 
 SCHEMA_VERSION = 1
 APPLICATION_ID = 0x67616D65  # SQLite's field for "whose file is this": "game"
@@ -124,7 +125,7 @@ class Store:
             raise OutputError(
                 f"{self.path} is a store of schema version {version}, not {SCHEMA_VERSION} as this program's: name another with --store"
             )
-        self._write_ahead()
+        write_ahead(self._connection, _BUSY_S)
         self._connection.execute("PRAGMA synchronous = NORMAL")
         self._connection.execute("BEGIN IMMEDIATE")
         if self._version() is None:  # not while another sweep creates it
@@ -134,18 +135,6 @@ class Store:
             self._connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         self._connection.execute(_SWEEPS)
         self._connection.execute("COMMIT")
-
-    def _write_ahead(self) -> None:
-        """Put a new file into WAL mode, which SQLite refuses at once, without its usual wait, while another sweep does the same."""
-        deadline = time.monotonic() + _BUSY_S
-        while True:
-            try:
-                self._connection.execute("PRAGMA journal_mode = WAL")
-                return
-            except sqlite3.OperationalError as error:
-                if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() > deadline:
-                    raise
-            time.sleep(0.01)
 
     def _version(self) -> int | None:
         """None for a new file; raises OutputError for a database of someone else."""

@@ -19,6 +19,7 @@ import httpx
 import uvicorn
 
 from server.app import create_app
+from server.connections import bounded_protocol
 from server.settings import Limits, Settings
 
 KEY = "a key of more than sixteen characters"
@@ -33,7 +34,9 @@ def settings(folder: Path, *, clips: Path | None = None, api_key: str | None = N
 @contextlib.contextmanager
 def serving(of: Settings) -> Iterator[httpx.Client]:
     """A client of a service that is up, without a runner."""
-    config = uvicorn.Config(create_app(of), log_level="critical", server_header=False, timeout_graceful_shutdown=1)
+    config = uvicorn.Config(
+        create_app(of), http=bounded_protocol(of.limits), log_level="critical", server_header=False, timeout_graceful_shutdown=1
+    )
     server = uvicorn.Server(config)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         thread = threading.Thread(target=server.run, args=([listener],))

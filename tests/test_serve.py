@@ -235,11 +235,12 @@ def test_every_answer_says_what_a_browser_has_to_beware_of_and_no_other_origin_i
         assert answer.headers["x-content-type-options"] == "nosniff" and answer.headers["x-frame-options"] == "DENY"
         assert not any(name.startswith("access-control") for name in answer.headers) and "server" not in answer.headers
     assert "access-control-allow-origin" not in client.get(path, headers={"Origin": "https://evil.example"}).headers
-    for headers in ({"Origin": "https://evil.example"}, {"Sec-Fetch-Site": "cross-site"}, {"Origin": "null"}):
+    for headers in ({"Origin": "https://evil.example"}, {"Sec-Fetch-Site": "cross-site"}, {"Origin": "null"}, {"Origin": "http://["}):
         assert client.post("/api/v1/client-latencies", json=PLAYED, headers=headers).status_code == 403
     own = {"Origin": str(client.base_url).rstrip("/"), "Sec-Fetch-Site": "same-origin"}
     assert client.post("/api/v1/client-latencies", json=PLAYED, headers=own).status_code == 201
     assert client.get(path, headers={"Host": "evil.example"}).status_code == 403
+    assert client.get(path, headers={"Host": f"127.0.0.2:{client.base_url.port}"}).status_code == 200
 
 
 def test_errors_are_one_sentence_without_a_stack(

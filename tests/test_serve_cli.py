@@ -13,6 +13,7 @@ import psutil
 import pytest
 
 from server import serve
+from server.guards import is_loopback
 from tests.serving import KEY, ROOT, Command
 
 DOCUMENT = (ROOT / "docs/serve.md").read_text()
@@ -40,6 +41,12 @@ def test_it_listens_to_others_only_with_a_key(host: str, capsys: pytest.CaptureF
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "::1", "localhost"])
 def test_loopback_needs_none(host: str) -> None:
     assert serve.settings_of(serve.parser().parse_args(["--host", host]), None).loopback
+    assert is_loopback(host)  # what it prints is let in
+
+
+@pytest.mark.parametrize("host", ["", "0.0.0.0", "192.168.1.2", "127.0.0.1.example.org", "localhost.example.org", "::2"])
+def test_what_is_no_loopback(host: str) -> None:
+    assert not is_loopback(host)
 
 
 def test_what_it_cannot_use_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -53,6 +53,14 @@ def picture(client: httpx.Client, frame: int, **query: Any) -> np.ndarray:
         return np.asarray(image)
 
 
+def test_a_clip_without_a_container_has_frames_to_look_at(client: httpx.Client, of: Settings, make_clip: Callable[..., Path]) -> None:
+    make_clip("clips/raw.h264", width=96, height=72)
+    clip = client.get("/api/v1/clips/raw.h264").json()
+    assert (clip["frames"], clip["duration_s"]) == (12, 0.4)
+    until(lambda: client.get("/api/v1/frames/raw.h264/11").status_code == 200)
+    assert client.get("/api/v1/frames/raw.h264/12").status_code == 404
+
+
 def test_a_picture_is_that_of_the_sweep(client: httpx.Client, of: Settings, tmp_path: Path) -> None:
     clip = list(read_frames(tmp_path / "clips/clip.mkv"))
     first = client.get(f"{FRAMES}/5")

@@ -116,6 +116,14 @@ def test_rates_that_differ_and_are_not_whole_are_refused(clip: Path, tmp_path: P
         assert sentence in refusal(capsys, clip, "--render", clip, other, "--store", tmp_path / "store")
 
 
+@pytest.mark.parametrize("name", ["vfr.mp4", "vfr.mkv"])
+def test_a_varying_rate_is_refused(name: str, make_clip: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Bits a second would be those of another clip."""
+    varying = make_clip(name, frames=9, pts=[0, 1, 2, 3, 10, 11, 12, 20, 30])
+    said = refusal(capsys, varying, "--store", tmp_path / "store")
+    assert "names 30 frames a second and has 8: its rate varies" in said and "ffmpeg -i INPUT -vf fps=30 OUTPUT" in said
+
+
 def imageio_ffmpeg() -> str:
     import imageio_ffmpeg
 
