@@ -11,7 +11,7 @@ from typing import Any
 
 import onnxruntime as ort
 
-from client.errors import ModelError, ProviderError
+from client.errors import ModelError, ProviderError, how_to_install
 
 FORMAT = "1"
 MAX_FILE_BYTES = 64 * 2**20
@@ -85,7 +85,8 @@ class _NotUnderstood(Exception):
 
 def _check_provider(provider: str) -> None:
     if ORT_PROVIDERS[provider] not in ort.get_available_providers():
-        raise ProviderError(f"this ONNX Runtime has no {provider} provider: install it with pip install 'gamesr[{provider}]'")
+        other = "pip uninstall onnxruntime onnxruntime-gpu, then, "  # both install the same module
+        raise ProviderError(f"this ONNX Runtime has no {provider} provider: {other}{how_to_install(provider)}")
 
 
 def read_artifact(model: Path) -> bytes:
@@ -130,7 +131,7 @@ def _read_spec(metadata: dict[str, str], sha256: str) -> ModelSpec:
             sha256=sha256,
             card=dict(json.loads(metadata["card"])),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise _NotUnderstood(f"its metadata is incomplete or wrong ({error})") from error
     if not is_short_word(spec.name) or not is_short_word(spec.precision):
         raise _NotUnderstood("its name or its precision is not a short word")
@@ -141,10 +142,15 @@ def _read_spec(metadata: dict[str, str], sha256: str) -> ModelSpec:
     if spec.reach is not None and (not 0 <= spec.reach <= MAX_REACH or spec.reach % spec.size_multiple):
         raise _NotUnderstood(f"its reach is {spec.reach}, not a multiple of {spec.size_multiple} up to {MAX_REACH}")
     for state in spec.state:
+        if not all(isinstance(text, str) and is_short_word(text) for text in (state.input, state.output, state.dtype)):
+            raise _NotUnderstood("the names of a state or its type are not short words")
         if state.dtype not in _TENSOR_TYPES:
             raise _NotUnderstood(f"its state {state.input} is {state.dtype}")
         if not _is_count(state.channels, MAX_STATE_CHANNELS) or not _is_count(state.divisor, 64) or spec.size_multiple % state.divisor:
             raise _NotUnderstood(f"its state {state.input} has {state.channels} channels at 1/{state.divisor} of the size")
+    for fact in ("parameters", "macs_540p"):
+        if not isinstance(spec.card.get(fact), int | None):
+            raise _NotUnderstood(f"its card's {fact} is not a whole number")
     return spec
 
 
@@ -171,4 +177,7 @@ def _check_tensors(session: ort.InferenceSession, spec: ModelSpec) -> None:
 
 
 def _listing(tensors: dict[str, tuple[str, int]]) -> str:
-    return ", ".join(f"{name} {kind.removeprefix('tensor')} rank {rank}" for name, (kind, rank) in tensors.items())
+    return ", ".join(
+        f"{name if is_short_word(name) else ascii(name[:MAX_WORD])} {kind.removeprefix('tensor')} rank {rank}"
+        for name, (kind, rank) in tensors.items()
+    )

@@ -7,14 +7,13 @@ import json
 import statistics
 import sys
 import tempfile
-import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import onnxruntime
 
-from client.errors import GamesrError
+from client.command import run_command, whole_number
 from client.measurement import WARM_UP_FRAMES, Run, Task, measure_in_fresh_process
 from client.models import find_model, shipped_models
 from client.runtime import PROVIDERS
@@ -130,10 +129,10 @@ def parser() -> argparse.ArgumentParser:
         help="a shipped model at every scale it has, or an .onnx file; repeatable (default: all)",
     )
     parser.add_argument("--clip", metavar="FILE", type=Path, help="the video to upscale (default: a made one, at two sizes)")
-    parser.add_argument("--frames", metavar="N", type=_count, default=30, help="frames that count in a run (default: %(default)s)")
-    parser.add_argument("--rounds", metavar="N", type=_count, default=5, help="runs of every model (default: %(default)s)")
+    parser.add_argument("--frames", metavar="N", type=whole_number(), default=30, help="frames that count in a run (default: %(default)s)")
+    parser.add_argument("--rounds", metavar="N", type=whole_number(), default=5, help="runs of every model (default: %(default)s)")
     parser.add_argument("--provider", choices=PROVIDERS, default="cpu", help="what runs the models (default: %(default)s)")
-    parser.add_argument("--threads", metavar="N", type=_count, help="threads of the model (default: the physical cores)")
+    parser.add_argument("--threads", metavar="N", type=whole_number(), help="threads of the model (default: the physical cores)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
     parser.add_argument("--debug", action="store_true", help="show where an error came from")
     return parser
@@ -142,16 +141,15 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     arguments = parser().parse_args(argv)
-    try:
-        results = bench(arguments)
-    except KeyboardInterrupt:
-        return _fail("interrupted", 130)
-    except GamesrError as error:
-        if arguments.debug:
-            traceback.print_exc()
-        return _fail(str(error), 1)
-    print(json.dumps(_record(results, arguments)) if arguments.json else _table(results, arguments))
-    return 0
+
+    def work() -> None:
+        try:
+            results = bench(arguments)
+        finally:
+            _progress("")
+        print(json.dumps(_record(results, arguments)) if arguments.json else _table(results, arguments), flush=True)
+
+    return run_command(PROGRAM, work, debug=arguments.debug)
 
 
 def bench(arguments: argparse.Namespace) -> list[Result]:
@@ -166,7 +164,6 @@ def bench(arguments: argparse.Namespace) -> list[Result]:
                     _progress(f"round {number} of {arguments.rounds}: {model.stem} on {clip.stem}")
                     run = measure_in_fresh_process(Task(model, clip, arguments.frames, arguments.provider, arguments.threads))
                     runs.setdefault((clip, model), []).append(run)
-    _progress("")
     yardsticks = {(clip, of[0].spec.scale): of for (clip, model), of in runs.items() if model == find_model(YARDSTICK, of[0].spec.scale)}
     return [Result(of, yardsticks[clip, of[0].spec.scale]) for (clip, _), of in runs.items()]
 
@@ -236,16 +233,3 @@ def _progress(line: str) -> None:
     if sys.stderr.isatty():
         sys.stderr.write(f"\r\x1b[K{line}")
         sys.stderr.flush()
-
-
-def _count(text: str) -> int:
-    count = int(text)
-    if count < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not 1 or more")
-    return count
-
-
-def _fail(sentence: str, status: int) -> int:
-    _progress("")
-    print(f"{PROGRAM}: {sentence}", file=sys.stderr)
-    return status

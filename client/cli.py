@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import signal
 import sys
-import traceback
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from client.baselines import Baselines
+from client.command import run_command, whole_number
 from client.compare import ComparisonWriter
 from client.detail import DetailUpscaler
-from client.errors import GamesrError, InputError, ModelError, OutputError
+from client.errors import InputError, ModelError, OutputError
 from client.models import DEFAULT_MODEL, find_model
 from client.pipeline import Upscaler, upscale_stream
 from client.progress import Progress
@@ -63,7 +60,7 @@ def parser() -> argparse.ArgumentParser:
         "--scale", type=int, choices=(2, 3), help="how many times as wide and high (default: 2, or what the model FILE is for)"
     )
     parser.add_argument("--provider", choices=PROVIDERS, default="cpu", help="what runs the network (default: %(default)s)")
-    parser.add_argument("--threads", metavar="N", type=_thread_count, help="threads of the network (default: the physical cores)")
+    parser.add_argument("--threads", metavar="N", type=whole_number(most=1024), help="threads of the network (default: the physical cores)")
     parser.add_argument(
         "--reference", metavar="HR", type=Path, help="the original, SCALE times as large: measure against it, frame by frame"
     )
@@ -90,28 +87,19 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     arguments = parser().parse_args(argv)
-    for signum in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(signum, _interrupt)
-    try:
-        summary = upscale(arguments)
+
+    def work() -> None:
+        try:
+            summary = upscale(arguments)
+        except MemoryError:
+            raise OutputError(f"not enough memory to upscale {arguments.input}: use a smaller video or scale") from None
         print(json.dumps(summary.record()) if arguments.json else summary.text(), flush=True)
-    except KeyboardInterrupt:
-        return _fail("interrupted, nothing was written", 130)
-    except GamesrError as error:
-        if arguments.debug:
-            traceback.print_exc()
-        return _fail(str(error), 1)
-    except MemoryError:
-        return _fail(f"not enough memory to upscale {arguments.input}: use a smaller video or scale", 1)
-    except BrokenPipeError:
-        # Whoever read the summary has gone; the interpreter would complain again when it flushes at its end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    return 0
+
+    return run_command(PROGRAM, work, debug=arguments.debug, interrupted="interrupted, nothing was written")
 
 
 def upscale(arguments: argparse.Namespace) -> Summary:
-    """Everything between the arguments and the summary. Raises GamesrError, and leaves nothing behind when it does."""
+    """Everything between the arguments and the summary. Raises GamesrError, and leaves nothing half made behind when it does."""
     with ExitStack() as stack:
         source = stack.enter_context(VideoSource(arguments.input))
         model = find_model(arguments.model, arguments.scale or 2)
@@ -121,7 +109,6 @@ def upscale(arguments: argparse.Namespace) -> Summary:
             raise ModelError(f"model {model} upscales by {scale}, not by {arguments.scale}: leave out --scale or name another model")
         output = arguments.output or _default_output(arguments.input, scale)
         _check_distinct(output, arguments)
-        sink = stack.enter_context(FileSink(output, source, force=arguments.force))
         size = source.width * scale, source.height * scale
         skipping = skipping_upscaler(upscaler) if arguments.skip_unchanged else None
         detail = None
@@ -139,6 +126,8 @@ def upscale(arguments: argparse.Namespace) -> Summary:
             names = ("bicubic", "lanczos") if reference else ("bicubic",)
             # The yardstick is one, whatever runs ours: what a runtime's precision costs must not be taken from it as well.
             baselines = Baselines(names, scale, provider="cpu", threads=arguments.threads)
+        # After the comparison, so that it appears before it: what took the time is there whatever becomes of a picture of it.
+        sink = stack.enter_context(FileSink(output, source, force=arguments.force))
         (detail or upscaler).warm_up(source.height, source.width)
         chosen: Upscaler[Any] = skipping or detail or upscaler
         stream = upscale_stream(source, chosen, sink)
@@ -215,22 +204,3 @@ def _share(text: str) -> float:
     if not 0 < share < 1:
         raise argparse.ArgumentTypeError(f"{text} is not between 0 and 1")
     return share
-
-
-def _thread_count(text: str) -> int:
-    count = int(text)
-    if not 1 <= count <= 1024:
-        raise argparse.ArgumentTypeError(f"{text} is not between 1 and 1024")
-    return count
-
-
-def _interrupt(signum: int, frame: FrameType | None) -> None:
-    # A second signal must not stop the removal of the unfinished file.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    raise KeyboardInterrupt
-
-
-def _fail(sentence: str, status: int) -> int:
-    print(f"{PROGRAM}: {sentence}", file=sys.stderr)
-    return status

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import secrets
+import os
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -16,6 +16,7 @@ from client.quality import squared_error
 from client.rgb import RgbPicture, to_png, to_rgb
 from client.sink import MUXERS, FileSink
 from client.video import VideoSource
+from client.whole_file import write_whole
 
 AREA_FRACTION = 8
 MAGNIFICATION = 4
@@ -84,7 +85,7 @@ class _OnePicture:
     def __init__(self, path: Path, labels: tuple[str, str], force: bool) -> None:
         if not path.parent.is_dir():
             raise OutputError(f"cannot write {path}: the folder {path.parent} does not exist")
-        if path.exists() and not force:
+        if os.path.lexists(path) and not force:
             raise OutputError(f"{path} exists: name another file with --compare, or replace it with --force")
         self._path, self._labels = path, labels
         self._most = -1
@@ -99,14 +100,7 @@ class _OnePicture:
     def close(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if kind is not None or self._chosen is None:
             return
-        partial = self._path.with_name(f".{self._path.name[:64]}.{secrets.token_hex(4)}.part")
-        try:
-            partial.write_bytes(to_png(_compose(*self._chosen, self._labels)))
-            partial.replace(self._path)
-        except OSError as failure:
-            raise OutputError(f"cannot write {self._path}: {failure.strerror}") from failure
-        finally:
-            partial.unlink(missing_ok=True)
+        write_whole(self._path, to_png(_compose(*self._chosen, self._labels)))
 
 
 class _Overlay:

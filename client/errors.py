@@ -26,3 +26,8 @@ class ModelError(GamesrError):
 
 class ProviderError(GamesrError):
     pass
+
+
+def how_to_install(*extras: str) -> str:
+    """What to do where an extra is missing: the end of a sentence. No package index has a GameSR, so no name on one is advised."""
+    return f"in the folder of its source, pip install -c constraints.txt '.[{','.join(extras)}]'"

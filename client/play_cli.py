@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import gc
 import json
-import os
 import re
 import signal
 import sys
@@ -17,7 +16,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from types import FrameType
 
-from client.errors import GamesrError
+from client.command import fail, reader_gone, whole_number
+from client.errors import GamesrError, how_to_install
 from client.pipeline import Sink
 from client.play_overlay import OverlayLines
 from client.play_post import post_summary
@@ -70,11 +70,11 @@ def parser() -> argparse.ArgumentParser:
     )
     tiers.add_argument("--model", metavar="NAME|FILE", help="this model alone, in time or not")
     parser.add_argument("--provider", choices=PROVIDERS, default="cpu", help="what runs the networks (default: %(default)s)")
-    parser.add_argument("--threads", metavar="N", type=_count, help="threads of the networks (default: the physical cores)")
+    parser.add_argument("--threads", metavar="N", type=whole_number(), help="threads of the networks (default: the physical cores)")
     parser.add_argument(
         "--deadline-ms", metavar="MS", type=_positive, help="from a frame's arrival to its presentation (default: one frame's duration)"
     )
-    parser.add_argument("--frames", metavar="N", type=_count, help="end after so many frames were shown")
+    parser.add_argument("--frames", metavar="N", type=whole_number(), help="end after so many frames were shown")
     parser.add_argument("--seconds", metavar="S", type=_positive, help="end after so long")
     parser.add_argument("--until-bye", action="store_true", help="end with the stream (default: wait for the next one)")
     parser.add_argument("--post", metavar="URL", help="post the latencies to a gamesr-serve; its key is taken from GAMESR_API_KEY")
@@ -101,19 +101,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments.post:
             post_summary(arguments.post, summary.posted())
     except KeyboardInterrupt:
-        status = _fail("interrupted", 1)
+        status = fail(PROGRAM, "interrupted")
     except GamesrError as error:
         if arguments.debug:
             traceback.print_exc()
-        status = _fail(str(error), 1)
+        status = fail(PROGRAM, str(error))
     except ModuleNotFoundError as error:
         if error.name not in ("aiortc", "sdl2"):
             raise
-        status = _fail("playing needs the extra `play`: pip install 'gamesr[play]'", 1)
+        status = fail(PROGRAM, f"playing needs the extra `play`: {how_to_install('play')}")
     except BrokenPipeError:
-        # Whoever read the summary has gone; the interpreter would complain again when it flushes at its end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        status = 1
+        status = reader_gone()
     return asked.status or status
 
 
@@ -207,20 +205,8 @@ def _names(text: str) -> list[str]:
     return names
 
 
-def _count(text: str) -> int:
-    count = int(text)
-    if not 1 <= count <= 10**9:
-        raise argparse.ArgumentTypeError(f"{text} is not between 1 and 1000000000")
-    return count
-
-
 def _positive(text: str) -> float:
     number = float(text)
     if not 1e-3 <= number <= 1e6:
         raise argparse.ArgumentTypeError(f"{text} is not between 0.001 and 1000000")
     return number
-
-
-def _fail(sentence: str, status: int) -> int:
-    print(f"{PROGRAM}: {sentence}", file=sys.stderr)
-    return status

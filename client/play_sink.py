@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import secrets
 from collections.abc import Iterator
 from dataclasses import replace
@@ -67,7 +68,7 @@ class Y4mSink:
     def __init__(self, path: Path, *, force: bool = False) -> None:
         self.path, self.period_ns = path, 1_000_000_000 // 60
         self._force = force
-        if path.exists() and (not force or not path.is_file()):
+        if os.path.lexists(path) and (not force or not path.is_file()):
             reason = "name another file, or replace it with --force" if path.is_file() else "it is not a file"
             raise OutputError(f"cannot write {path}, which exists: {reason}")
         if not path.parent.is_dir():

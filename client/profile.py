@@ -7,7 +7,6 @@ import json
 import statistics
 import sys
 import tempfile
-import traceback
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,8 +16,8 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from client.artifact import ModelSpec, load_session, read_artifact, session_options
+from client.command import run_command, whole_number
 from client.cores import physical_cores
-from client.errors import GamesrError
 from client.models import DEFAULT_MODEL, find_model
 from client.runtime import OPENVINO, OpenVinoRuntime
 from client.upscaler import plane_shapes
@@ -127,8 +126,8 @@ def parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--scale", type=int, choices=(2, 3), default=2, help="of a shipped model (default: %(default)s)")
     parser.add_argument("--provider", choices=PROFILED, default="cpu", help="what runs the model (default: %(default)s)")
-    parser.add_argument("--threads", metavar="N", type=_count, help="threads of the model (default: the physical cores)")
-    parser.add_argument("--frames", metavar="N", type=_count, default=30, help="frames that count (default: %(default)s)")
+    parser.add_argument("--threads", metavar="N", type=whole_number(), help="threads of the model (default: the physical cores)")
+    parser.add_argument("--frames", metavar="N", type=whole_number(), default=30, help="frames that count (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="a JSON line an operation instead of the table")
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     return parser
@@ -138,26 +137,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     arguments = parser().parse_args(argv)
     threads = arguments.threads or physical_cores()
-    try:
+
+    def work() -> None:
         spec, parts = profile(find_model(arguments.model, arguments.scale), arguments.provider, threads, arguments.frames)
-    except GamesrError as error:
-        if arguments.debug:
-            traceback.print_exc()
-        print(f"{PROGRAM}: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print(f"{PROGRAM}: interrupted", file=sys.stderr)
-        return 130
-    if arguments.json:
-        for part in parts:
+        for part in parts if arguments.json else ():
             print(json.dumps(asdict(part)))
-    else:
-        print(f"{spec.name} x{spec.scale} on {arguments.provider}, threads {threads}\n\n{table(parts)}")
-    return 0
+        if not arguments.json:
+            print(f"{spec.name} x{spec.scale} on {arguments.provider}, threads {threads}\n\n{table(parts)}")
+        sys.stdout.flush()
 
-
-def _count(text: str) -> int:
-    count = int(text)
-    if count < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not 1 or more")
-    return count
+    return run_command(PROGRAM, work, debug=arguments.debug)

@@ -134,8 +134,8 @@ def _bind(address: Address) -> socket.socket:
     try:
         family, kind, protocol, _, resolved = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         listening = socket.socket(family, kind, protocol)
-    except OSError as error:
-        raise InputError(f"{host} is no address to listen on: {error.strerror}") from error
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"{host} is no address to listen on: {getattr(error, 'strerror', 'it is no name of a host')}") from error
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SOCKET_BYTES)
         listening.bind(resolved)

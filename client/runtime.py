@@ -13,7 +13,7 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from client.artifact import ORT_PROVIDERS, ModelSpec, load_session, read_artifact
-from client.errors import ModelError, ProviderError
+from client.errors import ModelError, ProviderError, how_to_install
 from client.norms import norms_in_place
 from client.precise import states_in_float32
 
@@ -110,7 +110,7 @@ def openvino() -> ModuleType:
     try:
         return importlib.import_module("openvino")
     except ImportError as error:
-        raise ProviderError("OpenVINO is not installed: install it with pip install 'gamesr[cpu,openvino]'") from error
+        raise ProviderError(f"OpenVINO is not installed: {how_to_install('cpu', 'openvino')}") from error
 
 
 class OpenVinoRuntime:

@@ -103,8 +103,10 @@ class RtpSender:
         try:
             family, kind, protocol, _, target = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
             self._socket = socket.socket(family, kind, protocol)
-        except OSError as error:
-            raise InputError(f"{host} port {port} is no address to send to: {error.strerror}") from error
+        except (OSError, UnicodeError) as error:
+            raise InputError(
+                f"{host} port {port} is no address to send to: {getattr(error, 'strerror', 'it is no name of a host')}"
+            ) from error
         self._target = target
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SOCKET_BYTES)
         self.requests = 0

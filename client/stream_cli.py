@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import secrets
-import signal
-import sys
-import traceback
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
 from client.cloud import NetworkSettings
-from client.errors import GamesrError, OutputError
+from client.command import run_command, whole_number
+from client.errors import OutputError, how_to_install
 from client.video import VideoSource
+from client.whole_file import write_whole
 
 PROGRAM = "gamesr-stream"
 EXAMPLES = """\
@@ -39,9 +38,11 @@ def parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("clip", metavar="CLIP", type=Path, help="the video that stands for the game")
     parser.add_argument("--to", metavar="HOST:PORT", type=_address, required=True, help="who receives it")
-    parser.add_argument("--height", metavar="N", type=_positive, help="reduce the picture to this height, a whole part of the clip's")
+    parser.add_argument(
+        "--height", metavar="N", type=whole_number(most=8192), help="reduce the picture to this height, a whole part of the clip's"
+    )
     parser.add_argument("--bitrate", metavar="RATE", type=kbps, help="such as 8M or 4500k (default: 8M)")
-    parser.add_argument("--fps", metavar="N", type=_positive, help="pictures a second (default: the clip's)")
+    parser.add_argument("--fps", metavar="N", type=whole_number(most=8192), help="pictures a second (default: the clip's)")
     parser.add_argument("--intra-refresh", action="store_true", help="a wandering column of intra blocks instead of IDRs")
     parser.add_argument("--copy", action="store_true", help="send the clip's own H.264, not encoded again")
     parser.add_argument("--loop", action="store_true", help="begin again at the end")
@@ -56,29 +57,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args(argv)
     if arguments.copy and (arguments.height or arguments.bitrate or arguments.intra_refresh):
         parser().error("--copy sends what is there: --height, --bitrate and --intra-refresh are for encoding")
-    for signum in (signal.SIGINT, signal.SIGTERM):  # also where a shell that started it in the background has it ignore the first
-        signal.signal(signum, signal.default_int_handler)
-    try:
-        return send(arguments)
-    except KeyboardInterrupt:
-        print(f"{PROGRAM}: interrupted before anything was sent", file=sys.stderr)
-        return 130
-    except GamesrError as error:
-        if arguments.debug:
-            traceback.print_exc()
-        return _fail(str(error))
-    except ModuleNotFoundError as error:
-        if error.name != "aiortc":
-            raise
-        return _fail("streaming needs the extra `play`: pip install 'gamesr[play]'")
+    return run_command(PROGRAM, lambda: send(arguments), debug=arguments.debug, interrupted="interrupted before anything was sent")
 
 
 def send(arguments: argparse.Namespace) -> int:
     """Everything between the arguments and the summary. Raises GamesrError."""
-    from client.sdp import write_sdp  # these need the extra `play`
-    from client.sender import RtpSender, UnitSource, stream
-    from client.stream_source import EncodedFile, EncodedLive
-
+    try:
+        from client.sdp import write_sdp  # not above: without its packages the sentence below has to come
+        from client.sender import RtpSender, UnitSource, stream
+        from client.stream_source import EncodedFile, EncodedLive
+    except ModuleNotFoundError as error:
+        raise OutputError(f"streaming needs {error.name}: {how_to_install('play')}") from error
+    if arguments.sdp and os.path.lexists(arguments.sdp) and not arguments.force:
+        raise OutputError(f"{arguments.sdp} exists: name another file with --sdp, or replace it with --force")
     with VideoSource(arguments.clip) as clip:
         fps = arguments.fps or max(1, round(clip.frame_rate))
         height = arguments.height or clip.height
@@ -93,7 +84,7 @@ def send(arguments: argparse.Namespace) -> int:
     pictures = packets = octets = late = status = 0
     with RtpSender(host, port) as sender:
         if arguments.sdp:
-            _write(arguments.sdp, write_sdp(*sender.target, source.parameter_sets(), fps), force=arguments.force)
+            write_whole(arguments.sdp, write_sdp(*sender.target, source.parameter_sets(), fps))
         try:
             for done in stream(source, sender):
                 pictures, packets, octets = pictures + 1, packets + done.packets, octets + done.bytes
@@ -108,19 +99,6 @@ def send(arguments: argparse.Namespace) -> int:
         flush=True,
     )
     return status
-
-
-def _write(path: Path, text: str, *, force: bool) -> None:
-    """Whole or not at all; raises OutputError."""
-    if path.exists() and not force:
-        raise OutputError(f"{path} exists: use --force to replace it")
-    partial = path.with_name(f".{path.name[:64]}.{secrets.token_hex(4)}.part")
-    try:
-        partial.write_bytes(text.encode())
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
 
 
 def _address(text: str) -> tuple[str, int]:
@@ -140,15 +118,3 @@ def kbps(text: str) -> int:
     if not 1 <= rate <= 1_000_000:
         raise argparse.ArgumentTypeError(f"{text} is not between 1k and 1000M")
     return rate
-
-
-def _positive(text: str) -> int:
-    number = int(text)
-    if not 1 <= number <= 8192:
-        raise argparse.ArgumentTypeError(f"{text} is not between 1 and 8192")
-    return number
-
-
-def _fail(sentence: str) -> int:
-    print(f"{PROGRAM}: {sentence}", file=sys.stderr)
-    return 1

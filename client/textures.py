@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from ctypes import byref, c_uint8
 from typing import Any
 
-from client.errors import OutputError
+from client.errors import OutputError, how_to_install
 from client.frames import ColourTags, Frame
 from client.overlay import text_box
 
@@ -19,7 +19,7 @@ def load_sdl() -> Any:
             warnings.simplefilter("ignore")  # it says which library it took
             import sdl2
     except ImportError as error:
-        hint = "pip install 'gamesr[play]', and where that brings no SDL the system's libsdl2-2.0-0"
+        hint = f"{how_to_install('play')}, and where that brings no SDL the system's libsdl2-2.0-0"
         raise OutputError(f"no window can be opened without PySDL2 and SDL 2 ({error}): {hint}") from error
     return sdl2
 

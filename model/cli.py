@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, fields
 from itertools import islice
 from pathlib import Path
@@ -15,7 +15,8 @@ import torch
 from tqdm import tqdm
 
 from client.artifact import load_session
-from client.errors import GamesrError, InputError, ModelError
+from client.command import run_command, whole_number
+from client.errors import InputError, ModelError
 from client.runtime import PROVIDERS
 from client.upscaler import OnnxUpscaler
 from client.video import read_frames
@@ -83,7 +84,9 @@ def train_main(argv: Sequence[str] | None = None) -> int:
         ("halvings", "how often the learning rate is halved over the run"),
         ("seed", "of weights and crops"),
     ):
-        parser.add_argument(f"--{name}", type=int, default=defaults[name], help=f"{text} (default: %(default)s)")
+        parser.add_argument(
+            f"--{name}", type=whole_number(0 if name == "seed" else 1), default=defaults[name], help=f"{text} (default: %(default)s)"
+        )
     parser.add_argument("--learning-rate", type=float, default=defaults["learning_rate"], help="AdamW's first rate (default: %(default)s)")
     parser.add_argument(
         "--loss",
@@ -103,10 +106,10 @@ def train_main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--cache", type=Path, default=Path("runs/cache"), help="decoded footage, may be deleted (default: %(default)s)")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu", help="cpu or cuda (default here: %(default)s)")
-    parser.add_argument("--threads", type=int, help="CPU threads (default: all)")
+    parser.add_argument("--threads", type=whole_number(most=1024), help="CPU threads (default: all)")
     parser.add_argument("--compile", action="store_true", help="torch.compile: a quarter faster after a minute; needs a C++ compiler")
     parser.add_argument(
-        "--validate-every", type=int, default=1000, metavar="STEPS", help="held-out PSNR and a checkpoint (default: %(default)s)"
+        "--validate-every", type=whole_number(), default=1000, metavar="STEPS", help="held-out PSNR and a checkpoint (default: %(default)s)"
     )
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     arguments = parser.parse_args(argv)
@@ -126,7 +129,12 @@ def train_main(argv: Sequence[str] | None = None) -> int:
         )
         trainer.run(validate_every=arguments.validate_every, progress=sys.stderr.isatty())
 
-    return run_command(parser, arguments, work, f"stopped; the same command goes on from the last checkpoint in {arguments.run}")
+    return run_command(
+        parser.prog,
+        work,
+        debug=arguments.debug,
+        interrupted=f"stopped; the same command goes on from the last checkpoint in {arguments.run}",
+    )
 
 
 def verify_main(argv: Sequence[str] | None = None) -> int:
@@ -139,7 +147,7 @@ def verify_main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("model", type=Path, help="a trained .onnx artifact; with --hard a baseline too")
     parser.add_argument("clip", type=Path, nargs="?", help="a low-resolution video; it is played forwards and backwards")
-    parser.add_argument("--steps", type=int, default=300, help="recurrent steps, without --hard (default: %(default)s)")
+    parser.add_argument("--steps", type=whole_number(), default=300, help="recurrent steps, without --hard (default: %(default)s)")
     parser.add_argument(
         "--crop",
         metavar="WxH",
@@ -167,7 +175,14 @@ def verify_main(argv: Sequence[str] | None = None) -> int:
         parser.error("CLIP may be left out, and --cases given, with --hard only")
     if arguments.hard and len(arguments.provider) > 1:
         parser.error("--hard takes one --provider")
-    return run_command(parser, arguments, lambda: _verify_hard(arguments) if arguments.hard else _verify_parity(arguments), "stopped")
+
+    def work() -> None:
+        if arguments.hard:
+            _verify_hard(arguments)
+        else:
+            _verify_parity(arguments)
+
+    return run_command(parser.prog, work, debug=arguments.debug, interrupted="stopped")
 
 
 def _verify_parity(arguments: argparse.Namespace) -> None:
@@ -227,9 +242,9 @@ def evaluate_main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--models", nargs="+", default=["bicubic", "lanczos", "gamesr-paper", "gamesr"], metavar="NAME|FILE")
     parser.add_argument("--scales", nargs="+", type=int, choices=(2, 3), default=[2, 3])
     parser.add_argument("--degradations", nargs="+", default=["area", "area@8000", "area@4000"], metavar="HOW")
-    parser.add_argument("--frames", type=int, default=60, help="of each scene, from its start (default: %(default)s)")
+    parser.add_argument("--frames", type=whole_number(), default=60, help="of each scene, from its start (default: %(default)s)")
     parser.add_argument("--provider", choices=PROVIDERS, default="cpu", help="what runs the models (default: %(default)s)")
-    parser.add_argument("--threads", type=int, help="threads of the network (default: the physical cores)")
+    parser.add_argument("--threads", type=whole_number(most=1024), help="threads of the network (default: the physical cores)")
     parser.add_argument("--rows", type=Path, default=Path("runs/evaluation.jsonl"), help="measured rows, kept (default: %(default)s)")
     parser.add_argument("--cache", type=Path, default=Path("runs/cache"), help="decoded footage, may be deleted (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="a JSON line a row instead of the table")
@@ -262,24 +277,6 @@ def evaluate_main(argv: Sequence[str] | None = None) -> int:
         if not arguments.json:
             print(table(measured))
 
-    return run_command(parser, arguments, work, f"stopped; the same command goes on from the rows in {arguments.rows}")
-
-
-def run_command(parser: argparse.ArgumentParser, arguments: argparse.Namespace, work: Callable[[], None], interrupted: str) -> int:
-    """The exit status: 1 and one sentence for what went wrong, 130 for Ctrl-C."""
-    try:
-        work()
-    except GamesrError as error:
-        if arguments.debug:
-            raise
-        print(f"{parser.prog}: {error}", file=sys.stderr)
-        return 1
-    except OSError as error:
-        if arguments.debug:
-            raise
-        print(f"{parser.prog}: {error.filename or 'file'}: {error.strerror}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print(f"{parser.prog}: {interrupted}", file=sys.stderr)
-        return 130
-    return 0
+    return run_command(
+        parser.prog, work, debug=arguments.debug, interrupted=f"stopped; the same command goes on from the rows in {arguments.rows}"
+    )

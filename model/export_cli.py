@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from client.artifact import load_session
+from client.command import run_command
 from client.errors import InputError
 from client.models import WEIGHTS
 from model.artifact_files import new_artifacts
 from model.averaging import averaged
 from model.cards import card_page, training_card
-from model.cli import run_command
 from model.export import BASELINES, export_baseline, export_network
 from model.train import load_checkpoint, network_of
 
@@ -70,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         export_network(network, path, name=arguments.name, card=card, page=card_page)
         print(path)
 
-    return run_command(parser, arguments, work, "stopped")
+    return run_command(parser.prog, work, debug=arguments.debug, interrupted="stopped")
 
 
 def _share(text: str) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import io
 import json
-import os
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -20,11 +19,13 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 from tqdm import tqdm
 
+from client.command import run_command, whole_number
+from client.errors import InputError
 from client.measurement import WARM_UP_FRAMES, Task, measure_in_fresh_process
 from client.models import find_model
 from client.runtime import PROVIDERS
 from client.synthetic import write_synthetic_clip
-from model.cli import run_command
+from client.whole_file import write_whole
 from model.evaluate import Row, evaluate
 from model.footage import Degradation, FootageCache, load_scenes
 
@@ -76,11 +77,13 @@ class Candidate:
 
 
 def gains_over_bicubic(rows: Sequence[Row]) -> dict[str, dict[tuple[str, str], Gains]]:
-    """By input, then by (runtime, model), from rows of any runtimes that hold bicubic on cpu too."""
+    """By input, then by (runtime, model), from rows of any runtimes that hold bicubic on cpu too; raises InputError for no PSNR."""
     groups: dict[tuple[str, str, str, str], list[Row]] = {}
     for row in rows:
         title, degradation = row["clip"].split()
         groups.setdefault((degradation, row["provider"], row["model"], title.split("/")[0]), []).append(row)
+        if None in [row[plane] for plane in PLANES]:
+            raise InputError(f"{row['model']} gives a plane of {title} exactly, which has no PSNR: leave that scene out")
     gains: dict[str, dict[tuple[str, str], Gains]] = {}
     for degradation, provider, model in dict.fromkeys(key[:3] for key in groups):
         over: dict[str, list[float]] = {}
@@ -230,15 +233,15 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--providers", nargs="+", choices=PROVIDERS, default=["cpu"], help="runtimes (default: cpu)")
     parser.add_argument("--scale", type=int, choices=(2, 3), default=2)
     parser.add_argument("--degradations", nargs="+", default=["area", "area@8000"], metavar="HOW", help="inputs (default: %(default)s)")
-    parser.add_argument("--frames", type=int, default=24, help="of each scene, from its start (default: %(default)s)")
+    parser.add_argument("--frames", type=whole_number(), default=24, help="of each scene, from its start (default: %(default)s)")
     parser.add_argument(
         "--timed-frames",
         type=_timed_frames,
         default=30,
         help=f"frames of a timed run, {FEWEST_TIMED_FRAMES} at least (default: %(default)s)",
     )
-    parser.add_argument("--rounds", type=int, default=5, help="timed runs of each (default: %(default)s)")
-    parser.add_argument("--threads", type=int, help="threads of the models (default: the physical cores)")
+    parser.add_argument("--rounds", type=whole_number(), default=5, help="timed runs of each (default: %(default)s)")
+    parser.add_argument("--threads", type=whole_number(most=1024), help="threads of the models (default: the physical cores)")
     parser.add_argument("--rows", type=Path, default=Path("runs/evaluation.jsonl"), help="measured rows, kept (default: %(default)s)")
     parser.add_argument("--cache", type=Path, default=Path("runs/cache"), help="decoded footage, may be deleted (default: %(default)s)")
     parser.add_argument("--svg", type=Path, metavar="FILE", help="draw it")
@@ -262,12 +265,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     def work() -> None:
         candidates = measure(arguments)
         if arguments.svg:
-            partial = arguments.svg.with_name(f".{arguments.svg.name}.{os.getpid()}.part")
-            partial.write_bytes(drawing(candidates))
-            partial.replace(arguments.svg)
+            write_whole(arguments.svg, drawing(candidates))
         for candidate in candidates if arguments.json else ():
             print(json.dumps(asdict(candidate)))
         for degradation in () if arguments.json else candidates[0].gains:
             print(f"Input {degradation}:\n\n{table(candidates, degradation)}\n")
 
-    return run_command(command, arguments, work, f"stopped; the same command goes on from the rows in {arguments.rows}")
+    return run_command(
+        PROGRAM, work, debug=arguments.debug, interrupted=f"stopped; the same command goes on from the rows in {arguments.rows}"
+    )

@@ -6,13 +6,12 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from client.errors import InputError
+from client.command import run_command, whole_number
 from client.models import WEIGHTS
 from client.upscaler import OnnxUpscaler
 from model.artifact_files import new_artifacts
 from model.calibration import MADE_FRAMES
 from model.cards import card_page
-from model.cli import run_command
 from model.quantize import CALIBRATION_FRAMES, quantize
 
 EPILOG = """\
@@ -40,10 +39,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("model", type=Path, help="the float32 .onnx artifact of a trained GameSR network")
     parser.add_argument("name", help="the new model's name; its files are NAME_xSCALE.onnx and .md")
     parser.add_argument("clips", type=Path, nargs="+", metavar="clip", help="low-resolution videos of several scenes")
-    parser.add_argument("--frames", type=int, default=CALIBRATION_FRAMES, help="of each clip, from its start (default: %(default)s)")
+    parser.add_argument(
+        "--frames", type=whole_number(), default=CALIBRATION_FRAMES, help="of each clip, from its start (default: %(default)s)"
+    )
     parser.add_argument(
         "--made-frames",
-        type=int,
+        type=whole_number(),
         default=MADE_FRAMES,
         help="of each kind of made picture (letters, lines, noise): with more, noise comes out nearer and a flat sky not as near "
         "(default: %(default)s)",
@@ -54,8 +55,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
 
     def work() -> None:
-        if arguments.frames < 1 or arguments.made_frames < 1:
-            raise InputError("--frames and --made-frames must be 1 or more")
         scale = OnnxUpscaler(arguments.model, threads=1).spec.scale
         (path,) = new_artifacts(arguments.name, [scale], arguments.folder, source=arguments.model, force=arguments.force)
         quantize(
@@ -69,4 +68,4 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
         print(path)
 
-    return run_command(parser, arguments, work, "stopped")
+    return run_command(parser.prog, work, debug=arguments.debug, interrupted="stopped")

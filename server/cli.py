@@ -6,17 +6,16 @@ import argparse
 import json
 import os
 import shlex
-import signal
 import sys
-import traceback
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from importlib.util import find_spec
 from pathlib import Path
-from types import FrameType
 
+from client.command import run_command, whole_number
 from client.cores import physical_cores
-from client.errors import GamesrError, OutputError
+from client.errors import GamesrError, OutputError, how_to_install
+from client.whole_file import write_whole
 from server.cluster import DaskWorkers
 from server.events import (
     Event,
@@ -29,7 +28,7 @@ from server.events import (
     SweepDone,
     event_record,
 )
-from server.export import points_csv, sweep_json, write_whole
+from server.export import points_csv, sweep_json
 from server.plan import Plan, Request, make_plan
 from server.points import LatencyResult, PointResult
 from server.progress import SweepProgress
@@ -91,8 +90,10 @@ def parser() -> argparse.ArgumentParser:
         default=[],
         help="SMALL shows the same frames as CLIP, rendered at half or a third of its size; repeatable",
     )
-    parser.add_argument("--fps", metavar="N", type=_count, help="frames a second, a whole part of the clips' own rate (default: that rate)")
-    parser.add_argument("--frames", metavar="N", type=_count, help="measure at most so many frames of each clip (default: all)")
+    parser.add_argument(
+        "--fps", metavar="N", type=whole_number(), help="frames a second, a whole part of the clips' own rate (default: that rate)"
+    )
+    parser.add_argument("--frames", metavar="N", type=whole_number(), help="measure at most so many frames of each clip (default: all)")
     parser.add_argument(
         "--lpips",
         metavar="FILE",
@@ -100,7 +101,11 @@ def parser() -> argparse.ArgumentParser:
         help="an ONNX file of LPIPS: two RGB pictures in, float32 (1, 3, H, W) in -1..1, one number out",
     )
     parser.add_argument(
-        "--jobs", metavar="N", type=_count, default=physical_cores(), help="worker processes (default: the physical cores, %(default)s)"
+        "--jobs",
+        metavar="N",
+        type=whole_number(),
+        default=physical_cores(),
+        help="worker processes (default: the physical cores, %(default)s)",
     )
     parser.add_argument("--dask", metavar="ADDRESS", help="compute on the cluster of this Dask scheduler; latency is still measured here")
     parser.add_argument(
@@ -119,25 +124,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     arguments = parser().parse_args(argv)
     command = shlex.join([PROGRAM, *(sys.argv[1:] if argv is None else argv)])
-    for signum in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(signum, _interrupt)
-    try:
+
+    def work() -> None:
         failures = sweep(arguments, command)
-    except KeyboardInterrupt:
-        return _fail(f"interrupted: what was finished is in {arguments.store}, and the same command goes on", 130)
-    except GamesrError as error:
-        if arguments.debug:
-            traceback.print_exc()
-        return _fail(str(error), 1)
-    except BrokenPipeError:
-        # Whoever read the events has gone; the interpreter would complain again when it flushes at its end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    if failures:
-        if arguments.debug:
-            print(failures[0].trace, file=sys.stderr)
-        return _fail(f"{len(failures)} points or latencies could not be measured, the first one because {failures[0].reason}", 1)
-    return 0
+        if failures:
+            if arguments.debug:
+                print(failures[0].trace, file=sys.stderr)
+            raise GamesrError(f"{len(failures)} points or latencies could not be measured, the first one because {failures[0].reason}")
+
+    kept = f"interrupted: what was finished is in {arguments.store}, and the same command goes on"
+    return run_command(PROGRAM, work, debug=arguments.debug, interrupted=kept)
 
 
 def sweep(arguments: argparse.Namespace, command: str) -> list[PointFailed | LatencyFailed]:
@@ -202,18 +198,21 @@ def _prepare(out: Path | None, force: bool) -> None:
         return
     missing = [name for name in ("bjontegaard", "matplotlib") if find_spec(name) is None]
     if missing:
-        raise OutputError(f"the report of --out needs {' and '.join(missing)}: pip install 'gamesr[sweep]'")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        if any(out.iterdir()) and not force:
-            raise OutputError(f"{out} is not empty: name another folder with --out, or replace what is in it with --force")
-    except OSError as error:
-        raise OutputError(f"cannot write into {out}: {error.strerror}") from error
+        raise OutputError(f"the report of --out needs {' and '.join(missing)}: {how_to_install('sweep')}")
+    there = next(folder for folder in (out.absolute(), *out.absolute().parents) if os.path.lexists(folder))
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        raise OutputError(f"cannot write into {out}: {there} is {'not writable' if there.is_dir() else 'no folder'}")
+    if there == out.absolute() and any(out.iterdir()) and not force:
+        raise OutputError(f"{out} is not empty: name another folder with --out, or replace what is in it with --force")
 
 
 def _write(out: Path, found: _Found, command: str) -> None:
     from server.report import write_report  # not above: every worker would load a drawing library
 
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot write into {out}: {error.strerror}") from error
     write_whole(out / "points.csv", points_csv(found.points))
     write_whole(out / "sweep.json", sweep_json(found.points, found.latencies, found.done))
     write_report(out, found.points, found.latencies, command=command)
@@ -224,31 +223,15 @@ def _names(text: str) -> list[str]:
 
 
 def _counts(text: str) -> list[int]:
-    return [_count(part) for part in text.split(",")]
+    return [whole_number()(part) for part in text.split(",")]
 
 
 def _megabits(text: str) -> list[int]:
     """Megabits a second, as kilobits."""
-    values = [round(float(part) * 1000) for part in text.split(",")]
+    try:
+        values = [round(float(part) * 1000) for part in text.split(",")]
+    except (ValueError, OverflowError):
+        values = [0]
     if not all(1 <= value <= 1_000_000 for value in values):
         raise argparse.ArgumentTypeError(f"{text} is not between 0.001 and 1000 megabits a second")
     return values
-
-
-def _count(text: str) -> int:
-    count = int(text)
-    if count < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not 1 or more")
-    return count
-
-
-def _interrupt(signum: int, frame: FrameType | None) -> None:
-    # A second signal must not stop the workers from being stopped.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    raise KeyboardInterrupt
-
-
-def _fail(sentence: str, status: int) -> int:
-    print(f"{PROGRAM}: {sentence}", file=sys.stderr)
-    return status

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from client.errors import GamesrError
+from client.errors import GamesrError, how_to_install
 from server.job import Failed, Job, Outcome, run_job
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ class DaskWorkers:
         try:
             from distributed import Client
         except ImportError as error:
-            raise GamesrError("--dask needs the extra `dask`: pip install 'gamesr[dask]'") from error
+            raise GamesrError(f"--dask needs the extra `dask`: {how_to_install('dask')}") from error
         try:
             self._client: Client = Client(address, timeout=_CONNECT_S)
         except (OSError, ValueError) as error:

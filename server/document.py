@@ -75,8 +75,13 @@ def _markdown(block: Block) -> str:
             return f"![{_plain(description)}]({name}.png)"
         case Table(heads, rows, title):
             lines = [heads, ["---", *["---:"] * (len(heads) - 1)], *rows]
-            table = "\n".join(f"| {' | '.join(_plain(cell) for cell in line)} |" for line in lines)
+            table = "\n".join(table_line([_plain(cell) for cell in line]) for line in lines)
             return table if title is None else f"<details><summary>{html.escape(title)}</summary>\n\n{table}\n\n</details>"
+
+
+def table_line(cells: Sequence[str]) -> str:
+    """A row of a Markdown table, of cells in Markdown."""
+    return f"| {' | '.join(cells)} |"
 
 
 def _plain(text: str) -> str:

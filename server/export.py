@@ -5,12 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import json
-import secrets
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
-from client.errors import OutputError
 from server.events import SweepDone
 from server.points import LatencyResult, PointResult
 
@@ -33,18 +30,6 @@ def sweep_json(results: Sequence[PointResult], latencies: Sequence[LatencyResult
         "harness": {"work_s": done.work_s, "worker_s": done.worker_s, "overhead": done.overhead},
     }
     return json.dumps(record, indent=1, allow_nan=False) + "\n"
-
-
-def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file that appears whole or not at all; raises OutputError."""
-    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-    try:
-        partial.write_bytes(content if isinstance(content, bytes) else content.encode())
-        partial.replace(path)
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _row(result: PointResult) -> dict[str, Any]:

@@ -6,7 +6,6 @@ import argparse
 import json
 import sys
 import time
-import traceback
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
@@ -14,12 +13,14 @@ from pathlib import Path
 from statistics import median
 
 from client.cloud import NetworkSettings
-from client.errors import GamesrError, InputError, OutputError
+from client.command import run_command, whole_number
+from client.errors import InputError, OutputError, how_to_install
 from client.models import find_model
 from client.progress import clock
 from client.stream_cli import kbps
 from client.upscaler import OnnxUpscaler
-from server.export import write_whole
+from client.whole_file import write_whole
+from server.document import table_line
 from server.link import Weather
 from server.viewing import View, Viewing
 
@@ -124,9 +125,13 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("clip", metavar="CLIP", type=Path, help="a video at full size, which everything is measured against")
-    parser.add_argument("--height", metavar="N", type=_count, default=540, help="height that is sent (default: %(default)s)")
+    parser.add_argument(
+        "--height", metavar="N", type=whole_number(most=100_000), default=540, help="height that is sent (default: %(default)s)"
+    )
     parser.add_argument("--bitrate", metavar="RATE", type=kbps, default="8M", help="such as 8M or 4500k (default: %(default)s)")
-    parser.add_argument("--frames", metavar="N", type=_count, default=120, help="pictures to send in each row (default: %(default)s)")
+    parser.add_argument(
+        "--frames", metavar="N", type=whole_number(most=100_000), default=120, help="pictures to send in each row (default: %(default)s)"
+    )
     parser.add_argument("--models", metavar="A,B", type=_names, default="bicubic,gamesr", help="shipped or files (default: %(default)s)")
     parser.add_argument("--seed", metavar="N", type=int, default=1, help="of the losses (default: %(default)s)")
     drawn = ", ".join(DRAWN).replace("%", "%%")  # argparse would fill it in
@@ -141,30 +146,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     arguments = parser().parse_args(argv)
     begin = time.monotonic()
-    try:
+
+    def work() -> None:
         _prepare(arguments.out, arguments.force)
-        if not arguments.json:
-            heads = [*HEADS, *(f"{Path(model).stem}, dB" for model in arguments.models)]
-            print(_line(heads), _line(["---"] * len(heads)), sep="\n", flush=True)
         drawn: dict[str, Viewing] = {}
-        for row, seen in report(arguments):
-            print(json.dumps(asdict(row)) if arguments.json else _line(row.cells()), flush=True)
+        for number, (row, seen) in enumerate(report(arguments)):
+            if not number and not arguments.json:
+                heads = [*HEADS, *(f"{Path(model).stem}, dB" for model in arguments.models)]
+                print(table_line(heads), table_line(["---"] * len(heads)), sep="\n")
+            print(json.dumps(asdict(row)) if arguments.json else table_line(row.cells()), flush=True)
             if row.link in DRAWN:
                 drawn[f"{row.mode}, {row.link}"] = seen
         if arguments.out is not None:
             from server.plots import over_time_figure, rendered  # a drawing library, which is an extra
 
             write_whole(arguments.out, rendered(over_time_figure(drawn), "svg"))
-    except KeyboardInterrupt:
-        print(f"{PROGRAM}: interrupted", file=sys.stderr)
-        return 130
-    except GamesrError as error:
-        if arguments.debug:
-            traceback.print_exc()
-        print(f"{PROGRAM}: {error}", file=sys.stderr)
-        return 1
-    print(f"{PROGRAM}: {len(LINKS) * len(MODES)} rows in {clock(time.monotonic() - begin)}", file=sys.stderr)
-    return 0
+        print(f"{PROGRAM}: {len(LINKS) * len(MODES)} rows in {clock(time.monotonic() - begin)}", file=sys.stderr)
+
+    return run_command(PROGRAM, work, debug=arguments.debug)
 
 
 def report(arguments: argparse.Namespace) -> Iterator[tuple[Row, Viewing]]:
@@ -190,7 +189,7 @@ def _prepare(out: Path | None, force: bool) -> None:
     missing = {"aiortc": "play"} if out is None else {"aiortc": "play", "matplotlib": "sweep"}
     for module, extra in missing.items():
         if find_spec(module) is None:
-            raise OutputError(f"this needs {module}: pip install 'gamesr[{extra}]'")
+            raise OutputError(f"this needs {module}: {how_to_install(extra)}")
     if out is None:
         return
     if out.suffix != ".svg":
@@ -205,16 +204,5 @@ def _db(value: float | None) -> str:
     return "identical" if value is None else f"{value:.2f}"
 
 
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
 def _names(text: str) -> list[str]:
     return text.split(",")
-
-
-def _count(text: str) -> int:
-    count = int(text)
-    if not 1 <= count <= 100_000:
-        raise argparse.ArgumentTypeError(f"{text} is not between 1 and 100000")
-    return count

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from client.whole_file import write_whole
 from server.curves import METRICS, Series, series_by_clip
 from server.document import Block, Code, Heading, Picture, Table, Text, html_page, markdown
-from server.export import write_whole
 from server.plots import latency_figure, rd_figures, rendered
 from server.points import LatencyResult, PointResult
 from server.tables import Notes, bd_table, latency_table, points_table, saving_table

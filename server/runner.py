@@ -17,6 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from client.command import fail, whole_number
 from client.cores import physical_cores
 from client.errors import GamesrError, OutputError
 from server.database import Database
@@ -111,9 +112,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 0
     except OSError as error:
-        return _fail(f"cannot use {settings.data}: {error.strerror}")
+        return fail(PROGRAM, f"cannot use {settings.data}: {error.strerror}")
     except GamesrError as error:
-        return _fail(str(error))
+        return fail(PROGRAM, str(error))
     return 0
 
 
@@ -127,7 +128,11 @@ def add_folders(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--clips", metavar="DIR", type=Path, help="a folder whose clips may be swept by name")
     parser.add_argument(
-        "--jobs", metavar="N", type=_count, default=physical_cores(), help="worker processes (default: the physical cores, %(default)s)"
+        "--jobs",
+        metavar="N",
+        type=whole_number(),
+        default=physical_cores(),
+        help="worker processes (default: the physical cores, %(default)s)",
     )
 
 
@@ -176,15 +181,3 @@ def _locked(data: Path) -> Iterator[None]:
 
 def _lock_file(data: Path) -> Path:
     return data / "runner.lock"
-
-
-def _count(text: str) -> int:
-    count = int(text)
-    if count < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not 1 or more")
-    return count
-
-
-def _fail(sentence: str) -> int:
-    print(f"{PROGRAM}: {sentence}", file=sys.stderr)
-    return 1

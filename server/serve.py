@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 
-from client.errors import GamesrError, InputError, OutputError
+from client.errors import GamesrError, InputError, OutputError, how_to_install
 from server.guards import is_loopback
 from server.runner import RunnerProcess, add_folders
 from server.settings import Settings
@@ -99,7 +99,7 @@ def serve(arguments: argparse.Namespace) -> None:
         from server.app import create_app  # not above: without its packages the sentence below has to come
         from server.connections import bounded_protocol
     except ModuleNotFoundError as error:
-        raise OutputError(f"the service needs {error.name}: pip install 'gamesr[serve]'") from error
+        raise OutputError(f"the service needs {error.name}: {how_to_install('serve')}") from error
     app = create_app(settings)
     with _bind(arguments.host, arguments.port) as listener:
         host, port = listener.getsockname()[:2]

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
-import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import chain
@@ -15,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from client.cloud import CloudSettings, area_downscale
-from client.errors import GamesrError, InputError
+from client.command import run_command, whole_number
+from client.errors import InputError
 from client.frames import Frame
 from client.models import DEFAULT_MODEL, find_model
 from client.pipeline import upscale_stream
@@ -24,6 +23,7 @@ from client.runtime import PROVIDERS
 from client.sink import NullSink
 from client.skipping import skipping_upscaler
 from client.upscaler import OnnxUpscaler
+from server.document import table_line
 from server.encoding import EncodedStream, clip_frames
 
 PROGRAM = "gamesr-skipping"
@@ -126,7 +126,7 @@ ROWS: tuple[tuple[Scene, str], ...] = (
 class Row:
     """One scene under one rate control. `whole` is of computing all, the rest of skipping.
 
-    Times are processor time a frame, of all threads, for decoding and upscaling.
+    Times are processor time a frame, of all threads, for decoding and upscaling. A PSNR is None where nothing differs.
     """
 
     clip: str
@@ -137,8 +137,8 @@ class Row:
     tiles_skipped: float
     whole_ms: float
     skipping_ms: float
-    whole_psnr_y_db: float
-    psnr_y_lost_db: float
+    whole_psnr_y_db: float | None
+    psnr_y_lost_db: float | None
     differing_pixels: float
     max_difference: int
 
@@ -151,8 +151,8 @@ class Row:
             f"{100 * self.tiles_skipped:.1f}%",
             f"{self.whole_ms:.1f}",
             f"{saved:.1f} ({100 * saved / self.whole_ms:.1f}%)",
-            f"{self.whole_psnr_y_db:.2f}",
-            f"{self.psnr_y_lost_db:+.4f}",
+            "identical" if self.whole_psnr_y_db is None else f"{self.whole_psnr_y_db:.2f}",
+            "undefined" if self.psnr_y_lost_db is None else f"{self.psnr_y_lost_db:+.4f}",
             f"{100 * self.differing_pixels:.3f}%",
             f"{self.max_difference}",
         )
@@ -182,7 +182,7 @@ def measure(clip: str, frames: list[Frame], scene: Scene, rate_control: str, kbp
         count = stream.frames
         samples = count * frames[0].y.size
         whole_ms, skipping_ms = (ns / count / 1e6 for ns in times_ns)
-        whole_db, skipping_db = (psnr_db(error / samples) for error in errors)
+        whole_db, skipping_db = (psnr_db(error / samples) if error else None for error in errors)
         return Row(
             clip,
             scene.__name__,
@@ -193,7 +193,7 @@ def measure(clip: str, frames: list[Frame], scene: Scene, rate_control: str, kbp
             whole_ms,
             skipping_ms,
             whole_db,
-            whole_db - skipping_db,
+            None if whole_db is None or skipping_db is None else whole_db - skipping_db,
             differing / samples,
             greatest,
         )
@@ -209,8 +209,14 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("clips", metavar="CLIP", nargs="+", type=Path, help="a clip at full size, at least 8 frames")
     parser.add_argument("--model", metavar="NAME|FILE", default=DEFAULT_MODEL, help="a shipped x2 model or a file (default: %(default)s)")
     parser.add_argument("--provider", choices=PROVIDERS, default="cpu", help="what runs the model (default: %(default)s)")
-    parser.add_argument("--frames", metavar="N", type=_frame_count, default=60, help="frames of each clip to use (default: %(default)s)")
-    parser.add_argument("--kbps", metavar="N", type=_kbps, default=6000, help="bitrate of CBR and intra-refresh (default: %(default)s)")
+    parser.add_argument("--frames", metavar="N", type=whole_number(8), default=60, help="frames of each clip to use (default: %(default)s)")
+    parser.add_argument(
+        "--kbps",
+        metavar="N",
+        type=whole_number(most=1_000_000),
+        default=6000,
+        help="bitrate of CBR and intra-refresh (default: %(default)s)",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object a row instead of the table")
     parser.add_argument("--debug", action="store_true", help="show where an error came from")
     return parser
@@ -219,20 +225,14 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     arguments = parser().parse_args(argv)
-    try:
+
+    def work() -> None:
         for number, row in enumerate(report(arguments)):
             if not number and not arguments.json:
-                print(_line(HEADS), _line(["---"] * len(HEADS)), sep="\n")
-            print(json.dumps(asdict(row)) if arguments.json else _line(row.cells()), flush=True)
-    except KeyboardInterrupt:
-        print(f"{PROGRAM}: interrupted", file=sys.stderr)
-        return 130
-    except GamesrError as error:
-        if arguments.debug:
-            traceback.print_exc()
-        print(f"{PROGRAM}: {error}", file=sys.stderr)
-        return 1
-    return 0
+                print(table_line(HEADS), table_line(["---"] * len(HEADS)), sep="\n")
+            print(json.dumps(asdict(row)) if arguments.json else table_line(row.cells()), flush=True)
+
+    return run_command(PROGRAM, work, debug=arguments.debug)
 
 
 def report(arguments: argparse.Namespace) -> Iterator[Row]:
@@ -263,21 +263,3 @@ def _over(frame: Frame, patch: Frame, rows: slice, columns: slice) -> Frame:
 def _black(frame: Frame) -> Frame:
     level = 0 if frame.colour.range == 2 else 16
     return replace(frame, y=np.full_like(frame.y, level), u=np.full_like(frame.u, 128), v=np.full_like(frame.v, 128))
-
-
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
-def _frame_count(text: str) -> int:
-    count = int(text)
-    if count < 8:
-        raise argparse.ArgumentTypeError(f"{text} is not 8 or more")
-    return count
-
-
-def _kbps(text: str) -> int:
-    kbps = int(text)
-    if not 1 <= kbps <= 1_000_000:
-        raise argparse.ArgumentTypeError(f"{text} is not between 1 and 1000000")
-    return kbps

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from client.errors import GamesrError
 from client.measurement import in_fresh_process
-from server.export import write_whole
+from client.whole_file import write_whole
 from server.still import Still, render
 
 _KEPT_FAILURES = 256

@@ -116,7 +116,7 @@ def test_a_model_cannot_make_the_runtime_read_other_files(tmp_path: Path, monkey
 
 def test_a_missing_provider_names_what_to_install(model_file: ModelFile, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ort, "get_available_providers", lambda: ["CPUExecutionProvider"])
-    with pytest.raises(ProviderError, match=r"pip install 'gamesr\[cuda\]'"):
+    with pytest.raises(ProviderError, match=r"pip uninstall onnxruntime .*pip install -c constraints.txt '\.\[cuda\]'"):
         OnnxUpscaler(model_file(), provider="cuda")
     with pytest.raises(ProviderError, match="no provider 'tpu': choose one of cpu, cuda, openvino, openvino-bfloat16"):
         OnnxUpscaler(model_file(), provider="tpu")

@@ -291,7 +291,8 @@ def test_from_a_checkpoint_to_a_verified_int8_artifact(tmp_path: Path, capsys: p
     assert "made noise, 2x96 (40 frames)" in (tmp_path / "wider-int8_x2.md").read_text()
     capsys.readouterr()
     for option in ("--frames", "--made-frames"):
-        assert main([model, "tiny-int8", clip, option, "0", *into]) == 1
-        assert capsys.readouterr().err == "gamesr-quantize: --frames and --made-frames must be 1 or more\n"
+        with pytest.raises(SystemExit) as ended:
+            main([model, "tiny-int8", clip, option, "0", *into])
+        assert ended.value.code == 2 and f"{option}: 0 is not a whole number from 1" in capsys.readouterr().err
     assert main([quantized, "twice", clip, *into]) == 1
     assert capsys.readouterr().err.endswith("is int8 already: quantize the float32 artifact\n")

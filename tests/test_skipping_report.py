@@ -69,4 +69,4 @@ def test_a_bitrate_that_is_none_is_wrong_usage(capsys: pytest.CaptureFixture[str
     with pytest.raises(SystemExit) as ended:
         main(["clip.mp4", "--kbps", "-1"])
     assert ended.value.code == 2
-    assert "-1 is not between 1 and 1000000" in capsys.readouterr().err
+    assert "-1 is not a whole number from 1 to 1000000" in capsys.readouterr().err

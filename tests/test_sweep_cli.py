@@ -59,7 +59,7 @@ def test_the_command_prints_writes_and_keeps(clip: Path, tmp_path: Path, capsys:
     assert "is not empty" in refusal(capsys, *arguments)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cli, "find_spec", lambda name: None)
-        assert "pip install 'gamesr[sweep]'" in refusal(capsys, *arguments, "--force")
+        assert "pip install -c constraints.txt '.[sweep]'" in refusal(capsys, *arguments, "--force")
     status, out, _ = run(capsys, *arguments, "--force", "--json")
     events = [json.loads(line) for line in out.splitlines()]
     assert status == 0 and [event["event"] for event in events] == [

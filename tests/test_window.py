@@ -149,7 +149,7 @@ def test_no_display_is_one_sentence(monkeypatch: pytest.MonkeyPatch, driver: str
 
 def test_no_library_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "sdl2", None)
-    with pytest.raises(OutputError, match=r"^no window can be opened without .*pip install 'gamesr\[play\]'.*libsdl2-2\.0-0[^\n]*$"):
+    with pytest.raises(OutputError, match=r"^no window can be opened without .*pip install -c .* '\.\[play\]'.*libsdl2-2\.0-0[^\n]*$"):
         Window("test")
 
 

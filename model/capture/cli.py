@@ -6,14 +6,14 @@ import argparse
 import itertools
 import json
 import sys
-import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from tqdm import tqdm
 
+from client.command import run_command, whole_number
 from client.cores import physical_cores
-from client.errors import GamesrError, InputError
+from client.errors import InputError
 from model.capture.display import hidden_display
 from model.capture.filming import WINDOW, Shot, build_frame_clock, film, record
 from model.capture.games import GAMES, HEIGHTS, SPLITS, SceneSpec, choose, load_games
@@ -57,25 +57,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     recording.add_argument("--force", action="store_true", help="record again what has a demo")
     rendering = add("render", _render, "film what is missing, and keep what moves and matches", folder=True)
     rendering.add_argument(
-        "--heights", type=int, nargs="+", default=list(HEIGHTS), help="the reference's and lower ones (default: %(default)s)"
+        "--heights",
+        type=whole_number(2, 8192),
+        nargs="+",
+        default=list(HEIGHTS),
+        help="the reference's and lower ones (default: %(default)s)",
     )
-    rendering.add_argument("--jobs", type=int, default=physical_cores(), help="games at a time (default here: %(default)s)")
+    rendering.add_argument("--jobs", type=whole_number(), default=physical_cores(), help="games at a time (default here: %(default)s)")
     rendering.add_argument("--timeout", type=float, default=1800, metavar="SECONDS", help="of one shot (default: %(default)s)")
     checking = add("check", _check, "measure again what is there: hashes, motion, alignment", folder=True)
     checking.add_argument("--again", action="store_true", help="film the smallest size once more: are the frames the same, to the bit?")
     add("split", _split, "write FOLDER/footage.toml, the list that gamesr-train reads", folder=True)
     arguments = parser.parse_args(argv)
-    try:
-        scenes = choose(load_games(arguments.games), arguments.what)
-        return int(arguments.work(scenes, arguments))
-    except GamesrError as error:
-        if arguments.debug:
-            traceback.print_exc()
-        print(f"{PROGRAM}: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print(f"{PROGRAM}: stopped; the same command goes on from here", file=sys.stderr)
-        return 130
+
+    def work() -> int:
+        return int(arguments.work(choose(load_games(arguments.games), arguments.what), arguments))
+
+    return run_command(PROGRAM, work, debug=arguments.debug, interrupted="stopped; the same command goes on from here")
 
 
 def _adder(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> Callable[..., argparse.ArgumentParser]:

@@ -1,0 +1,69 @@
+"""How every command ends: one sentence for what went wrong, a status, and nothing left behind by a signal."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from types import FrameType
+
+from client.errors import GamesrError
+
+
+def run_command(program: str, work: Callable[[], int | None], *, debug: bool, interrupted: str = "interrupted") -> int:
+    """Do a command's work; returns the exit status, and prints `program` and one sentence to stderr where that is not the work's own.
+
+    1 for a GamesrError, a file that cannot be read or written, or when whoever reads the output has gone; 130 for Ctrl-C and SIGTERM,
+    which raise KeyboardInterrupt once: a second one must not stop what the first one made the work clear up.
+    """
+    for signum in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signum, _interrupt)
+    try:
+        return work() or 0
+    except KeyboardInterrupt:
+        return fail(program, interrupted, 130)
+    except GamesrError as error:
+        if debug:
+            traceback.print_exc()
+        return fail(program, str(error))
+    except BrokenPipeError:
+        return reader_gone()
+    except OSError as error:
+        if debug:
+            traceback.print_exc()
+        return fail(program, f"{error.filename}: {error.strerror}" if error.filename else str(error))
+
+
+def fail(program: str, sentence: str, status: int = 1) -> int:
+    """Say why a command ends with that status."""
+    print(f"{program}: {sentence}", file=sys.stderr)
+    return status
+
+
+def reader_gone() -> int:
+    """Whoever read the output has gone; the interpreter would complain again when it flushes at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 1
+
+
+def whole_number(least: int = 1, most: int = 1_000_000_000) -> Callable[[str], int]:
+    """An argument's type: a whole number from `least` to `most`."""
+
+    def parse(text: str) -> int:
+        try:
+            if least <= int(text) <= most:
+                return int(text)
+        except ValueError:
+            pass
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number from {least} to {most}")
+
+    return parse
+
+
+def _interrupt(signum: int, frame: FrameType | None) -> None:
+    for each in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(each, signal.SIG_IGN)
+    raise KeyboardInterrupt
