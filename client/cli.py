@@ -31,7 +31,7 @@ PROGRAM = "gamesr-upscale"
 EXAMPLES = """\
 examples:
   gamesr-upscale match.mp4
-      writes match_gamesr_x2.mp4 beside it, twice as wide and high, audio copied
+      writes match_gamesr_x2.mp4 beside it, twice as wide and high, audio and subtitles copied
   gamesr-upscale match_540p.mp4 -o match.mkv --reference match_1080p.mp4 --compare wipe.png
       also says how close this came to the original, bicubic and Lanczos beside it, and draws the difference
   gamesr-upscale match.mp4 --model bicubic --scale 3

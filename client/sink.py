@@ -14,9 +14,9 @@ import av
 import numpy as np
 from av.video.stream import VideoStream
 
-from client.audio import AudioCopy
 from client.errors import OutputError
 from client.frames import Frame
+from client.tracks import TrackCopy
 from client.video import VideoSource, to_av_frame
 
 MUXERS = {".mp4": "mp4", ".mkv": "matroska"}
@@ -36,7 +36,7 @@ class FileSink:
     """H.264 (x264, crf 12, veryfast) in .mp4 or .mkv; a context manager.
 
     Written under a temporary name beside `path` and renamed when the block ends, removed when an exception ends it. Keeps
-    of `source` the timestamps, colour tags, sample aspect ratio and display matrix, and copies its audio untouched.
+    of `source` the timestamps, colour tags, sample aspect ratio and display matrix, and copies its audio and its subtitles untouched.
     A picture of odd size is padded by one replicated row or column. `notes` says what was changed on the way.
 
     Raises OutputError, in one sentence, for another suffix, a path that exists (unless `force`) or that is the input
@@ -111,7 +111,7 @@ class _Encoding:
         with contextlib.ExitStack() as stack:
             self._container = stack.enter_context(av.open(str(path.absolute()), "w", format=muxer, container_options=clocks))
             self._stream = self._add_video(source, first)
-            self._audio = stack.enter_context(contextlib.closing(AudioCopy(source.path, self._container)))
+            self._tracks = stack.enter_context(contextlib.closing(TrackCopy(source.path, self._container)))
             self._open_files = stack.pop_all()
 
     def write(self, frame: Frame) -> None:
@@ -123,11 +123,11 @@ class _Encoding:
         picture = to_av_frame(_pad_to_even(frame))
         picture.pts, picture.time_base = self._next_pts(frame.pts), self._time_base
         self._container.mux(self._stream.encode(picture))
-        self._audio.copy_until(picture.pts * self._time_base)
+        self._tracks.copy_until(picture.pts * self._time_base)
 
     def finish(self) -> None:
         self._container.mux(self._stream.encode(None))
-        self._audio.copy_until(None)
+        self._tracks.copy_until(None)
         self._open_files.close()
 
     def abandon(self) -> None:
@@ -144,9 +144,7 @@ class _Encoding:
             )
         if self._moved_pts:
             notes.append(f"{self._moved_pts} frames had no timestamp or one that went back: theirs follow from the frame rate")
-        if self._audio.moved:
-            notes.append(f"{self._audio.moved} packets of sound had a timestamp that went back: each follows the one before")
-        return notes
+        return notes + self._tracks.notes()
 
     def _add_video(self, source: VideoSource, first: Frame) -> VideoStream:
         stream = self._container.add_stream("libx264", rate=source.frame_rate, options=dict(X264_OPTIONS))

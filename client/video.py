@@ -176,7 +176,8 @@ def open_local(path: Path) -> InputContainer:
         raise InputError(f"{path} is empty")
     try:
         # The prefix keeps a name with a colon from being read as an address.
-        return av.open(f"file:{path.absolute()}", "r", options={"protocol_whitelist": "file", "format_whitelist": CONTAINERS})
+        whitelists = {"protocol_whitelist": "file", "format_whitelist": CONTAINERS}
+        return av.open(f"file:{path.absolute()}", "r", options=whitelists, metadata_errors="replace")  # old titles are seldom UTF-8
     except PermissionError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from error
     except (av.FFmpegError, UnicodeError) as error:

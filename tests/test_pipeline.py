@@ -152,6 +152,50 @@ def test_pcm_without_a_channel_layout_is_copied(
     assert b"".join(data for data, _ in audio_packets(output)) == b"".join(data for data, _ in audio_packets(clip))
 
 
+def test_subtitles_chapters_and_names_are_kept_where_they_can_be(make_clip: MakeClip, upscaler: OnnxUpscaler, tmp_path: Path) -> None:
+    clip, subtitles, rich = make_clip("plain.mkv", audio="aac"), tmp_path / "words.srt", tmp_path / "rich.mkv"
+    subtitles.write_text("1\n00:00:00,100 --> 00:00:00,300\nHello\n")
+    chapters = [{"id": 1, "start": 0, "end": 200, "time_base": Fraction(1, 1000), "metadata": {"title": "The first"}}]
+    with av.open(str(clip)) as film, av.open(str(subtitles)) as words, av.open(str(rich), "w") as container:
+        container.metadata["title"] = "A match"
+        container.set_chapters(chapters)
+        targets = {stream.type: container.add_stream_from_template(stream) for stream in (*film.streams, *words.streams)}
+        targets["audio"].metadata["language"] = "ger"
+        for packet in (*film.demux(), *words.demux()):
+            if packet.size:
+                packet.stream = targets[packet.stream.type]
+                container.mux(packet)
+    notes = {}
+    for suffix in ("mkv", "mp4"):
+        with VideoSource(rich) as source, FileSink(tmp_path / f"out.{suffix}", source) as sink:
+            assert list(upscale_stream(source, upscaler, sink))
+        notes[suffix] = sink.notes
+        with av.open(str(sink.path)) as container:
+            assert container.metadata["title"] == "A match" and container.streams.audio[0].metadata["language"] == "ger"
+            assert [(c["metadata"]["title"], (c["end"] - c["start"]) * c["time_base"]) for c in container.chapters()] == [
+                ("The first", Fraction(1, 5))
+            ]
+            texts = [bytes(packet) for packet in container.demux() if packet.size and packet.stream.type == "subtitle"]
+        assert texts == ([b"Hello"] if suffix == "mkv" else [])
+    assert notes == {"mkv": [], "mp4": ["subtitle track 1 (srt) is left out: mp4 cannot hold it"]}
+
+
+def test_a_title_that_is_not_utf8_keeps_nobody_from_its_video(make_clip: MakeClip, upscaler: OnnxUpscaler, tmp_path: Path) -> None:
+    clip = make_clip("plain.mkv")
+    with av.open(str(clip)) as film, av.open(str(tmp_path / "old.mkv"), "w") as container:
+        container.metadata["title"] = "un cafe"
+        target = container.add_stream_from_template(film.streams.video[0])
+        for packet in film.demux():
+            if packet.size:
+                packet.stream = target
+                container.mux(packet)
+    old = tmp_path / "old.mkv"
+    old.write_bytes(old.read_bytes().replace(b"un cafe", b"un caf\xe9"))
+    assert len(through(old, upscaler, tmp_path / "out.mkv")) == FRAMES
+    with av.open(str(tmp_path / "out.mkv")) as container:
+        assert container.metadata["title"] == "un caf\ufffd"
+
+
 @pytest.mark.parametrize(
     ("name", "codec", "suffix", "advice"),
     [
