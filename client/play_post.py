@@ -29,7 +29,9 @@ class _NoRedirect(urllib.request.HTTPRedirectHandler):
 def post_summary(url: str, record: Mapping[str, object]) -> None:
     """Send a record to a gamesr-serve at `url`, with the key of GAMESR_API_KEY if there is one; raises OutputError, in one sentence."""
     headers = {"Content-Type": "application/json"}
-    if key := os.environ.get(KEY_VARIABLE):
+    if key := os.environ.get(KEY_VARIABLE, "").strip():  # a file that it was read from ends in a new line
+        if not key.isascii() or not key.isprintable():
+            raise OutputError(f"{KEY_VARIABLE} holds what no key has: it is printable characters")
         headers["X-API-Key"] = key
     try:
         if urlsplit(url).scheme not in ("http", "https") or not urlsplit(url).hostname:
@@ -42,8 +44,9 @@ def post_summary(url: str, record: Mapping[str, object]) -> None:
         with error:
             raise OutputError(f"{shown_url(url)} did not take the summary: {error.code} {_detail(error)}") from error
     except (OSError, ValueError, http.client.HTTPException) as error:
-        reason = getattr(error, "reason", None) or getattr(error, "strerror", None) or str(error) or type(error).__name__
-        raise OutputError(f"the summary could not be posted: {reason}") from error
+        reason = getattr(error, "reason", error)
+        reason = getattr(reason, "strerror", None) or str(reason) or type(error).__name__
+        raise OutputError(f"the summary could not be posted to {shown_url(url)}: {reason}") from error
 
 
 def _detail(error: urllib.error.HTTPError) -> str:

@@ -17,6 +17,7 @@ from tqdm import tqdm
 from client.artifact import load_session
 from client.command import run_command, whole_number
 from client.errors import InputError, ModelError
+from client.models import find_model
 from client.runtime import PROVIDERS
 from client.upscaler import OnnxUpscaler
 from client.video import read_frames
@@ -145,7 +146,11 @@ def verify_main(argv: Sequence[str] | None = None) -> int:
         epilog=VERIFY_EXAMPLES + "".join(f"  {case.name:14} {case.what}\n" for case in CASES),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("model", type=Path, help="a trained .onnx artifact; with --hard a baseline too")
+    parser.add_argument(
+        "model",
+        metavar="NAME|FILE",
+        help="a shipped model, such as live or live_x3, or a trained artifact; with --hard a baseline too",
+    )
     parser.add_argument("clip", type=Path, nargs="?", help="a low-resolution video; it is played forwards and backwards")
     parser.add_argument("--steps", type=whole_number(), default=300, help="recurrent steps, without --hard (default: %(default)s)")
     parser.add_argument(
@@ -169,14 +174,13 @@ def verify_main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="a JSON line a step and provider, or a hard case, instead of the table")
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     arguments = parser.parse_args(argv)
-    if arguments.steps < 1:
-        parser.error("--steps is at least 1")
     if arguments.hard is None and (arguments.clip is None or arguments.cases):
         parser.error("CLIP may be left out, and --cases given, with --hard only")
     if arguments.hard and len(arguments.provider) > 1:
         parser.error("--hard takes one --provider")
 
     def work() -> None:
+        arguments.model = find_model(arguments.model, 2)
         if arguments.hard:
             _verify_hard(arguments)
         else:
@@ -193,9 +197,9 @@ def _verify_parity(arguments: argparse.Namespace) -> None:
     _, spec = load_session(arguments.model, "cpu", 1)
     bounds = {provider: bounds_of(spec, provider) for provider in arguments.provider}
     errors: dict[str, list[StepError]] = {provider: [] for provider in arguments.provider}
-    if not arguments.json:
-        print(PARITY_HEADER)
     for error in parity(arguments.model, frames, arguments.steps, providers=list(errors), weights=arguments.weights):
+        if not any(errors.values()) and not arguments.json:  # with the first row: what is refused before it has no table
+            print(PARITY_HEADER)
         errors[error.provider].append(error)
         if arguments.json:
             print(json.dumps(asdict(error)))

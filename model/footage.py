@@ -67,7 +67,9 @@ def load_scenes(footage: Path, *, split: str, games: Iterable[str] = ()) -> list
             )
             for row in rows
         ]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except OSError as error:
+        raise InputError(f"{footage} cannot be read: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{footage} is not a footage list: {error}") from error
     by_name: dict[str, str] = {}
     for scene in scenes:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from client.command import run_command, whole_number
-from client.models import WEIGHTS
+from client.models import WEIGHTS, find_model
 from client.upscaler import OnnxUpscaler
 from model.artifact_files import new_artifacts
 from model.calibration import MADE_FRAMES
@@ -36,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("model", type=Path, help="the float32 .onnx artifact of a trained GameSR network")
+    parser.add_argument("model", metavar="NAME|FILE", help="a shipped float32 model, or the .onnx artifact of a trained GameSR network")
     parser.add_argument("name", help="the new model's name; its files are NAME_xSCALE.onnx and .md")
     parser.add_argument("clips", type=Path, nargs="+", metavar="clip", help="low-resolution videos of several scenes")
     parser.add_argument(
@@ -55,10 +55,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
 
     def work() -> None:
-        scale = OnnxUpscaler(arguments.model, threads=1).spec.scale
-        (path,) = new_artifacts(arguments.name, [scale], arguments.folder, source=arguments.model, force=arguments.force)
+        model = find_model(arguments.model, 2)
+        scale = OnnxUpscaler(model, threads=1).spec.scale
+        (path,) = new_artifacts(arguments.name, [scale], arguments.folder, source=model, force=arguments.force)
         quantize(
-            arguments.model,
+            model,
             path,
             arguments.clips,
             name=arguments.name,

@@ -90,7 +90,6 @@ class Trainer:
         self, config: TrainConfig, footage: Path, cache: FootageCache, folder: Path, *, device: str = "cpu", compiled: bool = False
     ):
         self.folder, self.config, self.device = folder, config, torch.device(device)
-        folder.mkdir(parents=True, exist_ok=True)
         degradations = [Degradation.parse(text) for text in config.degradations]
         self.train = load_pairs(load_scenes(footage, split="train", games=config.games), cache, config.scale, degradations)
         held_out = load_scenes(footage, split="validate", games=config.games)
@@ -104,6 +103,7 @@ class Trainer:
         self.before: list[dict[str, Any]] = []  # the runs that this one builds on, oldest first
         if config.initial_weights:
             self._start_from(Path(config.initial_weights))
+        folder.mkdir(parents=True, exist_ok=True)
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), config.learning_rate, betas=(0.9, 0.999), weight_decay=config.weight_decay
         )
@@ -251,6 +251,8 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     """A checkpoint's dictionary; raises ModelError when the file is not one. Nothing in it is executed."""
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise ModelError(f"{path} cannot be read: {error.strerror}") from error
     except Exception as error:  # torch raises whatever the unpickler met
         raise ModelError(f"{path} is not a checkpoint: {error}") from error
     if not isinstance(saved, dict) or saved.get("format") != CHECKPOINT_FORMAT:

@@ -84,7 +84,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.include_router(health.router)
     for subject in (sweeps, results, clips, frames, models, players):
         app.include_router(subject.router, prefix=PREFIX)
-    app.add_api_route("/", _page, include_in_schema=False)
+    app.add_api_route("/", _page, methods=["GET", "HEAD"], include_in_schema=False)
     app.mount("/static", StaticFiles(directory=PAGE, check_dir=False))
     app.openapi()  # written once, and not while requests wait
     return app

@@ -140,6 +140,6 @@ def test_every_shipped_model_is_understood_and_named_after_itself() -> None:
 def test_models_are_found_by_name_or_path(model_file: ModelFile) -> None:
     path = model_file()
     assert find_model(str(path), 2) == path
-    with pytest.raises(ModelError, match=r"no model named 'bicubik' ships for scale 2 \(there is .*bicubic_x2"):
+    with pytest.raises(ModelError, match=r"no model named 'bicubik' ships for scale 2 \(there is .*, bicubic, .*\); a file is named by"):
         find_model("bicubik", 2)
     assert find_model("nowhere/bicubic", 2) == Path("nowhere/bicubic")

@@ -201,10 +201,10 @@ def test_a_missing_folder_is_one_sentence(workshop: Path, capsys: pytest.Capture
 @pytest.mark.parametrize(
     ("main", "command", "sentence"),
     [
-        (train_main, ["missing.toml", "run"], "not a footage list"),
-        (export_main, ["missing.pt", "name"], "not a checkpoint"),
+        (train_main, ["missing.toml", "run"], "cannot be read: No such file"),
+        (export_main, ["missing.pt", "name"], "cannot be read: No such file"),
         (verify_main, ["missing.onnx", "missing.mp4"], "does not exist"),
-        (evaluate_main, ["missing.toml"], "not a footage list"),
+        (evaluate_main, ["missing.toml"], "cannot be read: No such file"),
     ],
 )
 def test_what_is_not_there_is_one_sentence(
