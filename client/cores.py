@@ -7,6 +7,8 @@ import platform
 import re
 from pathlib import Path
 
+CPUINFO = Path("/proc/cpuinfo")
+
 
 def physical_cores() -> int:
     """Physical cores among the logical ones that this process may run on; at least 1."""
@@ -21,6 +23,15 @@ def physical_cores() -> int:
 
 def machine_name() -> str:
     """The processor's name where the system tells it, else its kind."""
-    cpuinfo = Path("/proc/cpuinfo")
-    found = re.search(r"^model name\s*:\s*(.+)$", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.is_file() else None
-    return found[1] if found else platform.processor() or platform.machine()
+    return _told("model name") or platform.processor() or platform.machine()
+
+
+def has_amx() -> bool:
+    """Whether the system tells of a processor that multiplies matrices of bfloat16 and of 8 bits (Intel AMX)."""
+    return {"amx_tile", "amx_bf16", "amx_int8"} <= set(_told("flags").split())
+
+
+def _told(what: str) -> str:
+    """Of the first processor, by Linux; empty where nothing is said."""
+    found = re.search(rf"^{what}\s*:\s*(.+)$", CPUINFO.read_text(), re.MULTILINE) if CPUINFO.is_file() else None
+    return found[1] if found else ""

@@ -16,6 +16,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from types import FrameType
 
+from client.choice import AUTO, FLOAT_TIERS, INT8_TIERS, chosen_provider, chosen_tiers
 from client.command import fail, reader_gone, whole_number
 from client.errors import GamesrError, how_to_install
 from client.pipeline import Sink
@@ -31,16 +32,13 @@ from client.tiers import TieredUpscaler
 from client.video import MAX_SIDE
 
 PROGRAM = "gamesr-play"
-TIERS = "quality,balanced,live,fast,bicubic"
 MIN_QUIET_S, MAX_QUIET_S = 1.0, 60.0
 EXAMPLES = """\
 examples:
   gamesr-play 127.0.0.1:5004
       listens for gamesr-stream, or any RTP sender of H.264, and shows it in a window; F1 says how it goes, W wipes against bicubic
-  gamesr-play sender.sdp --fullscreen --provider openvino-bfloat16
-      the same by a session description
-  gamesr-play :5004 --provider openvino --tiers balanced-int8,live-int8,fast-int8,bicubic
-      on a processor without AMX, where 8 bits are the fast ones
+  gamesr-play sender.sdp --fullscreen --tiers live,fast,bicubic
+      the same by a session description, without the models that are too slow here anyway
   gamesr-play :5004 --sink null --seconds 60 --json
       measures: nothing is shown, one JSON object says what would have been
   gamesr-play rtsp://192.0.2.7/game --display 1920x1080 --sink match.y4m
@@ -66,10 +64,18 @@ def parser() -> argparse.ArgumentParser:
     )
     tiers = parser.add_mutually_exclusive_group()
     tiers.add_argument(
-        "--tiers", metavar="NAMES", type=_names, default=TIERS, help="models to move between, the best first (default: %(default)s)"
+        "--tiers",
+        metavar="NAMES",
+        type=_names,
+        help=f"models to move between, the best first (default: {','.join(FLOAT_TIERS)}; in OpenVINO without AMX {','.join(INT8_TIERS)})",
     )
     tiers.add_argument("--model", metavar="NAME|FILE", help="this model alone, in time or not")
-    parser.add_argument("--provider", choices=PROVIDERS, default="cpu", help="what runs the networks (default: %(default)s)")
+    parser.add_argument(
+        "--provider",
+        choices=(AUTO, *PROVIDERS),
+        default=AUTO,
+        help="what runs the networks (default: OpenVINO where it is installed, in bfloat16 where the processor has it, else cpu)",
+    )
     parser.add_argument("--threads", metavar="N", type=whole_number(), help="threads of the networks (default: the physical cores)")
     parser.add_argument(
         "--deadline-ms", metavar="MS", type=_positive, help="from a frame's arrival to its presentation (default: one frame's duration)"
@@ -119,9 +125,10 @@ def play(arguments: argparse.Namespace, asked: Asked) -> PlaySummary:
     """Everything between the arguments and the summary. Raises GamesrError."""
     say, display = Say(), arguments.display
     with ExitStack() as stack:
-        names = [arguments.model] if arguments.model else arguments.tiers
+        provider = chosen_provider() if arguments.provider == AUTO else arguments.provider
+        names = [arguments.model] if arguments.model else arguments.tiers or chosen_tiers(provider)
         height = display and display[1]
-        tiers = stack.enter_context(TieredUpscaler(names, display_height=height, provider=arguments.provider, threads=arguments.threads))
+        tiers = stack.enter_context(TieredUpscaler(names, display_height=height, provider=provider, threads=arguments.threads))
         sink: Sink = NullSink()
         window = file = None
         if arguments.sink == "window":
@@ -129,7 +136,7 @@ def play(arguments: argparse.Namespace, asked: Asked) -> PlaySummary:
             from client.window import Window
 
             shown = stack.enter_context(Window(f"{PROGRAM} {shown_source(arguments.source)}", fullscreen=arguments.fullscreen))
-            sink = window = WindowSink(shown, lambda: lines(), provider=arguments.provider, threads=arguments.threads)
+            sink = window = WindowSink(shown, lambda: lines(), provider=provider, threads=arguments.threads)
         elif arguments.sink != "null":
             sink = file = stack.enter_context(Y4mSink(Path(arguments.sink), force=arguments.force))
         if display and window is None:
@@ -201,7 +208,7 @@ def _size(text: str) -> tuple[int, int]:
 def _names(text: str) -> list[str]:
     names = text.split(",")
     if not all(names) or len(set(names)) < len(names):
-        raise argparse.ArgumentTypeError(f"{text} is not a list of different models such as {TIERS}")
+        raise argparse.ArgumentTypeError(f"{text} is not a list of different models such as live,bicubic")
     return names
 
 

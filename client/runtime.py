@@ -124,6 +124,11 @@ def _core() -> Any:
     return openvino().Core()
 
 
+def computes_in(provider: str) -> bool:
+    """Whether the processor has the precision of one of OPENVINO; raises ProviderError where that is not installed."""
+    return CAPABILITIES[OPENVINO[provider]] in _core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+
+
 class OpenVinoRuntime:
     """A graph compiled by OpenVINO for every size that it is used at, since fixed sizes save a third of a small network's time.
 
@@ -137,7 +142,7 @@ class OpenVinoRuntime:
         self._ov = openvino()
         self._core = _core()
         self._precision = OPENVINO[provider]
-        if CAPABILITIES[self._precision] not in self._core.get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
+        if not computes_in(provider):
             raise ProviderError(f"this processor does not compute in {provider.removeprefix('openvino-')}: use --provider openvino")
         self._content = content
         self._options = {

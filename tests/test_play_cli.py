@@ -14,6 +14,7 @@ import av
 import pytest
 
 from client import play_cli
+from client.choice import chosen_provider, chosen_tiers
 from client.errors import OutputError
 from client.frames import Frame
 from client.play_post import PATH, post_summary
@@ -36,7 +37,9 @@ def play(model_file: Callable[..., Path], capsys: pytest.CaptureFixture[str]) ->
 
     def run(*arguments: object) -> tuple[int, str, str]:
         given = list(map(str, arguments))
-        defaults = {"--sink": "null", "--deadline-ms": "100000"} | ({} if "--tiers" in given else {"--model": str(model_file())})
+        defaults = {"--sink": "null", "--deadline-ms": "100000", "--provider": "cpu"} | (
+            {} if "--tiers" in given else {"--model": str(model_file())}
+        )
         for option, value in defaults.items():
             given += [] if option in given else [option, value]
         status = play_cli.main([*given, "--threads", "1"])
@@ -64,6 +67,14 @@ def test_a_file_into_y4m(play: Play, make_clip: MakeClip, model_file: Callable[.
     status, _, errors = play(clip, "--sink", out)
     assert status == 1 and "--force" in errors
     assert play(clip, "--sink", out, "--force", "--frames", 3)[0] == 0 and len(list(read_frames(out))) == 3
+
+
+def test_where_nobody_chose_the_summary_says_what_ran(make_clip: MakeClip, capsys: pytest.CaptureFixture[str]) -> None:
+    clip = make_clip()
+    assert play_cli.main([str(clip), "--sink", "null", "--deadline-ms", "100000", "--frames", "2", "--json", "--threads", "1"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["provider"] == chosen_provider()
+    assert [tier["name"] for tier in record["tiers"]] == chosen_tiers(chosen_provider())
 
 
 def test_a_display_that_is_neither_twice_nor_three_times_as_large(play: Play, make_clip: MakeClip, tmp_path: Path) -> None:
