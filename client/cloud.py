@@ -55,6 +55,11 @@ def area_downscale(frame: Frame, scale: int) -> Frame:
 
 def area_scale(name: str, size: tuple[int, int], height: int) -> int:
     """By which pictures of `size` (width, height) are downscaled to `height`; raises InputError, about `name`, where that is not even."""
+    if size[0] % 2 or size[1] % 2:
+        even = ":".join(str(side - side % 2) for side in size)
+        raise InputError(
+            f"{name} is {size[0]}x{size[1]}, and H.264 needs even sides: crop it first, with ffmpeg -i INPUT -vf crop={even} OUTPUT"
+        )
     scale, rest = divmod(size[1], height)
     if rest or not scale or size[1] % (2 * scale) or size[0] % (2 * scale):
         raise InputError(f"{name} is {size[0]}x{size[1]}, which cannot be reduced to a height of {height} evenly")

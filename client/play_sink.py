@@ -126,7 +126,9 @@ class Y4mSink:
     def _header(self, frame: Frame) -> bytes:
         """Of one length whatever the rate, so that it can be written again at the end; 4:2:0 as MPEG-2 and H.264 site it."""
         width, height = self._size
-        rate = min(Fraction(1_000_000_000, max(1, self.period_ns)).limit_denominator(1001), Fraction(_GREATEST_RATE))
+        rate = Fraction(1_000_000_000, max(1, self.period_ns)).limit_denominator(1001)
+        if rate.numerator > _GREATEST_RATE:
+            rate = Fraction(min(round(rate), _GREATEST_RATE))
         colours = "FULL" if frame.colour.range == FULL_RANGE else "LIMITED"
         numbers = f"F{rate.numerator:0{_RATE_DIGITS}}:{rate.denominator:0{_RATE_DIGITS}}"
         return f"YUV4MPEG2 W{width} H{height} {numbers} Ip A1:1 C420mpeg2 XCOLORRANGE={colours}\n".encode()

@@ -33,8 +33,9 @@ from model.verify import PARITY_HEADER, StepError, crop, parity, parity_row, par
 
 TRAIN_EXAMPLES = """\
 The footage list is a TOML file of scenes (gamesr-footage makes one); scenes are split by map or track. A run lives in one
-folder and goes on where it stopped when the same command is given again:
+folder and goes on where it stopped when the same command is given again.
 
+examples:
   gamesr-train footage.toml runs/openarena_x2 --games openarena --steps 20000
   gamesr-train footage.toml runs/paper_x3 --preset paper --scale 3 --device cuda
   gamesr-train my_game.toml runs/my_live_x2 --preset live --initial-weights client/weights/live_x2.onnx --learning-rate 0.0003
@@ -46,9 +47,9 @@ live-wide and balanced-wide are what 8 bits run in as much time as live and bala
 
 VERIFY_EXAMPLES = """\
 examples:
-  gamesr-verify client/weights/gamesr_x2.onnx tests/footage/oa_koth1_540p.mp4
-  gamesr-verify client/weights/gamesr_x2.onnx tests/footage/oa_koth1_540p.mp4 --provider cpu openvino openvino-bfloat16
-  gamesr-verify client/weights/gamesr_x2.onnx tests/footage/oa_koth1_540p.mp4 --hard short
+  gamesr-verify gamesr tests/footage/oa_koth1_540p.mp4
+  gamesr-verify gamesr tests/footage/oa_koth1_540p.mp4 --provider cpu openvino openvino-bfloat16
+  gamesr-verify live_x3 tests/footage/oa_koth1_540p.mp4 --hard short
   gamesr-verify client/weights/gamesr_x2.onnx --hard full --cases still fade
 
 hard cases (docs/stability.md says more):

@@ -164,6 +164,8 @@ def sweep(arguments: argparse.Namespace, command: str) -> list[PointFailed | Lat
         print(summary(found.points, found.latencies, found.done), flush=True)
     if arguments.out and found.points:
         _write(arguments.out, found, command)
+        if not arguments.json:
+            print(f"the report, with savings and BD-rates: {arguments.out / 'report.html'}", flush=True)
     return found.failures
 
 

@@ -27,6 +27,15 @@ from server.run import run_queued
 from server.settings import Settings
 
 PROGRAM = "gamesr-runner"
+EXAMPLES = """\
+example:
+  gamesr-serve --no-runner --data /srv/gamesr --store /srv/sweep.sqlite --clips /srv/clips
+  gamesr-runner --data /srv/gamesr --store /srv/sweep.sqlite --clips /srv/clips
+      the service in one container, its sweeps in another, which may have more cores
+
+It waits for sweeps until it is stopped, and says on stderr what it runs. Exit status: 0 stopped, 1 refused (one sentence says why), 2
+wrong usage.
+"""
 _POLL_S = 0.2
 _END_S = 15.0
 _AGAIN_S = 1.0
@@ -100,6 +109,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
         description="Run the sweeps that wait for a gamesr-serve that was started with --no-runner on the same folder and store.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_folders(parser)
     arguments = parser.parse_args(argv)

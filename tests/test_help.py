@@ -18,3 +18,4 @@ def test_help_says_how_to_use_it(command: str, capsys: pytest.CaptureFixture[str
         getattr(importlib.import_module(module), function)(["--help"])
     said = capsys.readouterr().out
     assert exit_.value.code == 0 and said.startswith(f"usage: {command}") and "--help" in said
+    assert "example" in said

@@ -53,6 +53,11 @@ def test_y4m_is_whole_or_not_at_all(tmp_path: Path) -> None:
     with av.open(str(path)) as container:
         assert container.streams.video[0].average_rate == Fraction(60000, 1001)
     assert [(frame.width, frame.height) for frame in read_frames(path)] == [(48, 32)] * 2
+    for period_ns in (12_345, 1, 10**12):  # of times as only hostile files have them
+        with Y4mSink(path, force=True) as sink:
+            sink.write(picture(0))
+            sink.period_ns = period_ns
+        assert len(list(read_frames(path))) == 1
     for full, said in ((2, 2), (1, 1)):
         with Y4mSink(path, force=True) as sink:
             sink.write(Frame(*(np.full(s, 200, np.uint8) for s in ((4, 6), (2, 3), (2, 3))), colour=ColourTags(range=full)))
