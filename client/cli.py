@@ -16,6 +16,7 @@ from client.compare import ComparisonWriter
 from client.detail import DetailUpscaler
 from client.errors import InputError, ModelError, OutputError
 from client.models import DEFAULT_MODEL, find_model
+from client.pipe import PIPE, PipedVideo, PipeSink
 from client.pipeline import Upscaler, upscale_stream
 from client.progress import Progress
 from client.reference import Reference
@@ -25,7 +26,7 @@ from client.skipping import skipping_upscaler
 from client.summary import Summary
 from client.timing import Stamps
 from client.upscaler import OnnxUpscaler
-from client.video import VideoSource
+from client.video import OpenVideo, VideoSource
 
 PROGRAM = "gamesr-upscale"
 EXAMPLES = """\
@@ -36,6 +37,8 @@ examples:
       also says how close this came to the original, bicubic and Lanczos beside it, and draws the difference
   gamesr-upscale match.mp4 --model bicubic --scale 3
       a baseline in the network's place
+  ffmpeg -i match.mp4 -f yuv4mpegpipe - | gamesr-upscale - -o - | mpv -
+      between other programs: any stream that can be read from its beginning in, .y4m out
 
 Figures of speed leave out warm-up, measuring and comparing; the bicubic and Lanczos of --reference and --compare are always
 computed on the cpu provider, whatever computes ours. The output is encoded with x264 at crf 12, so that it shows the
@@ -51,8 +54,10 @@ def parser() -> argparse.ArgumentParser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("input", metavar="INPUT", type=Path, help="the video: H.264 or another codec, 8-bit, progressive")
-    parser.add_argument("-o", "--output", metavar="OUT", type=Path, help=".mp4 or .mkv (default: INPUT_gamesr_xSCALE beside the input)")
+    parser.add_argument("input", metavar="INPUT", type=Path, help="the video: H.264 or another codec, 8-bit, progressive; - for a pipe")
+    parser.add_argument(
+        "-o", "--output", metavar="OUT", type=Path, help=".mp4 or .mkv, or - for .y4m into a pipe (default: INPUT_gamesr_xSCALE beside it)"
+    )
     parser.add_argument(
         "--model", metavar="NAME|FILE", default=DEFAULT_MODEL, help="a shipped model or an .onnx file (default: %(default)s)"
     )
@@ -93,7 +98,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             summary = upscale(arguments)
         except MemoryError:
             raise OutputError(f"not enough memory to upscale {arguments.input}: use a smaller video or scale") from None
-        print(json.dumps(summary.record()) if arguments.json else summary.text(), flush=True)
+        said = sys.stderr if summary.output == PIPE else sys.stdout
+        print(json.dumps(summary.record()) if arguments.json else summary.text(), file=said, flush=True)
 
     return run_command(PROGRAM, work, debug=arguments.debug, interrupted="interrupted, nothing was written")
 
@@ -101,7 +107,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def upscale(arguments: argparse.Namespace) -> Summary:
     """Everything between the arguments and the summary. Raises GamesrError, and leaves nothing half made behind when it does."""
     with ExitStack() as stack:
-        source = stack.enter_context(VideoSource(arguments.input))
+        piped = arguments.input == PIPE
+        source = stack.enter_context(PipedVideo(sys.stdin.buffer) if piped else VideoSource(arguments.input))
         model = find_model(arguments.model, arguments.scale or 2)
         upscaler = OnnxUpscaler(model, provider=arguments.provider, threads=arguments.threads)
         scale = upscaler.spec.scale
@@ -127,7 +134,9 @@ def upscale(arguments: argparse.Namespace) -> Summary:
             # The yardstick is one, whatever runs ours: what a runtime's precision costs must not be taken from it as well.
             baselines = Baselines(names, scale, provider="cpu", threads=arguments.threads)
         # After the comparison, so that it appears before it: what took the time is there whatever becomes of a picture of it.
-        sink = stack.enter_context(FileSink(output, source, force=arguments.force))
+        sink = (
+            PipeSink(sys.stdout.buffer, source) if output == PIPE else stack.enter_context(FileSink(output, source, force=arguments.force))
+        )
         (detail or upscaler).warm_up(source.height, source.width)
         chosen: Upscaler[Any] = skipping or detail or upscaler
         stream = upscale_stream(source, chosen, sink)
@@ -149,7 +158,8 @@ def upscale(arguments: argparse.Namespace) -> Summary:
                     comparison.add(pictures["bicubic"], done.picture)
             progress.advance()
         if not stamps:
-            raise InputError(f"no frame of {arguments.input} could be decoded ({source.decode_errors} packets were refused)")
+            hint = "; an .mp4 has to be a file" if piped else ""
+            raise InputError(f"no frame of {source.name} could be decoded ({source.decode_errors} packets were refused){hint}")
         quality = reference.result() if reference else {}
         notes = _source_notes(source, len(stamps), measured=reference is not None) + (reference.notes if reference else [])
     computed_share = sum(computed_shares) / len(computed_shares)
@@ -168,11 +178,11 @@ def upscale(arguments: argparse.Namespace) -> Summary:
         skipped_share=1 - computed_share if skipping else None,
         network_share=computed_share if detail else None,
         quality=quality,
-        notes=notes + sink.notes,
+        notes=[*notes, *sink.notes],
     )
 
 
-def _source_notes(source: VideoSource, frames: int, *, measured: bool) -> list[str]:
+def _source_notes(source: OpenVideo, frames: int, *, measured: bool) -> list[str]:
     notes = []
     estimated = source.estimated_frames
     if source.announced_frames is None and estimated is not None and frames < 0.9 * estimated:  # a rate that varies is no cut
@@ -185,6 +195,8 @@ def _source_notes(source: VideoSource, frames: int, *, measured: bool) -> list[s
 
 
 def _default_output(path: Path, scale: int) -> Path:
+    if path == PIPE:
+        raise OutputError("standard input has no name to name the output after: give one with -o")
     suffix = ".mkv" if path.suffix.lower() == ".mkv" else ".mp4"
     return path.with_name(f"{path.stem}_gamesr_x{scale}{suffix}")
 
@@ -193,10 +205,11 @@ def _check_distinct(output: Path, arguments: argparse.Namespace) -> None:
     """No file may be written that is read, or written twice, whatever --force says."""
     taken = {path.resolve(): what for path, what in ((arguments.input, "the input"), (arguments.reference, "the reference")) if path}
     for path in (output, arguments.compare):
-        if path and path.resolve() in taken:
+        if path is None or path == PIPE:
+            continue
+        if path.resolve() in taken:
             raise OutputError(f"cannot write {path}: it is {taken[path.resolve()]}")
-        if path:
-            taken[path.resolve()] = "the output"
+        taken[path.resolve()] = "the output"
 
 
 def _share(text: str) -> float:

@@ -15,7 +15,7 @@ from client.frames import Frame, Plane
 from client.quality import squared_error
 from client.rgb import RgbPicture, to_png, to_rgb
 from client.sink import MUXERS, FileSink
-from client.video import VideoSource
+from client.video import OpenVideo
 from client.whole_file import write_whole
 
 AREA_FRACTION = 8
@@ -36,7 +36,7 @@ class ComparisonWriter:
     that is missing or full, and when no frame came.
     """
 
-    def __init__(self, path: Path, source: VideoSource, *, labels: tuple[str, str] = ("bicubic", "GameSR"), force: bool = False) -> None:
+    def __init__(self, path: Path, source: OpenVideo, *, labels: tuple[str, str] = ("bicubic", "GameSR"), force: bool = False) -> None:
         suffix = path.suffix.lower()
         if suffix not in (".png", *MUXERS):
             raise OutputError(f"cannot write {path}: the name of a comparison must end in .png or {' or '.join(MUXERS)}")

@@ -16,13 +16,10 @@ import av
 from av.video.reformatter import Interpolation, VideoReformatter
 
 from client.errors import OutputError
-from client.frames import Frame, Plane
+from client.frames import Frame
 from client.pipeline import Sink
 from client.video import from_av_frame, plane_view
-
-FULL_RANGE = 2  # AVColorRange
-_RATE_DIGITS = 7
-_GREATEST_RATE = 10**_RATE_DIGITS - 1
+from client.y4m import Y4mWriter
 
 
 class Resizer:
@@ -75,8 +72,7 @@ class Y4mSink:
             raise OutputError(f"cannot write {path}: the folder {path.parent} does not exist")
         self._partial = path.with_name(f".{path.name[:64]}.{secrets.token_hex(4)}.part")
         self._file: BinaryIO | None = None
-        self._first: Frame | None = None
-        self._size = 0, 0
+        self._writer: Y4mWriter | None = None
         self._resizer: Resizer | None = None
 
     def __enter__(self) -> Self:
@@ -84,10 +80,10 @@ class Y4mSink:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         try:
-            if self._file is not None and self._first is not None and kind is None:
+            if self._file is not None and self._writer is not None and kind is None:
                 with self._as_sentence():
                     self._file.seek(0)
-                    self._file.write(self._header(self._first))
+                    self._writer.header(self._rate())
                     self._file.close()
                     if self.path.exists() and not self._force:
                         raise OutputError(f"{self.path} has appeared while it was being made: name another file, or use --force")
@@ -100,38 +96,14 @@ class Y4mSink:
 
     def write(self, frame: Frame) -> None:
         with self._as_sentence():
-            if self._file is None or self._resizer is None:
+            if self._file is None or self._writer is None or self._resizer is None:
                 self._file = self._partial.open("xb", buffering=0)
                 self._resizer = Resizer(frame.width, frame.height)
-                self._first = replace(frame, y=frame.y[:1], u=frame.u[:1], v=frame.v[:1])
-                self._size = frame.width, frame.height
-                self._write(self._header(frame))
-            frame = self._resizer.resize(frame)
-            self._write(b"FRAME\n")
-            for plane in (frame.y, frame.u, frame.v):
-                self._write_plane(plane)
+                self._writer = Y4mWriter(self._file, frame, self._rate())
+            self._writer.picture(self._resizer.resize(frame))
 
-    def _write_plane(self, plane: Plane) -> None:
-        if plane.flags.c_contiguous:
-            self._write(plane.data)
-        else:
-            self._write(plane.tobytes())
-
-    def _write(self, data: bytes | memoryview) -> None:
-        assert self._file is not None
-        view = memoryview(data).cast("B")
-        while view:  # an unbuffered file may take a part
-            view = view[self._file.write(view) :]
-
-    def _header(self, frame: Frame) -> bytes:
-        """Of one length whatever the rate, so that it can be written again at the end; 4:2:0 as MPEG-2 and H.264 site it."""
-        width, height = self._size
-        rate = Fraction(1_000_000_000, max(1, self.period_ns)).limit_denominator(1001)
-        if rate.numerator > _GREATEST_RATE:
-            rate = Fraction(min(round(rate), _GREATEST_RATE))
-        colours = "FULL" if frame.colour.range == FULL_RANGE else "LIMITED"
-        numbers = f"F{rate.numerator:0{_RATE_DIGITS}}:{rate.denominator:0{_RATE_DIGITS}}"
-        return f"YUV4MPEG2 W{width} H{height} {numbers} Ip A1:1 C420mpeg2 XCOLORRANGE={colours}\n".encode()
+    def _rate(self) -> Fraction:
+        return Fraction(1_000_000_000, max(1, self.period_ns))
 
     @contextlib.contextmanager
     def _as_sentence(self) -> Iterator[None]:

@@ -17,7 +17,7 @@ from av.video.stream import VideoStream
 from client.errors import OutputError
 from client.frames import Frame
 from client.tracks import TrackCopy
-from client.video import VideoSource, to_av_frame
+from client.video import OpenVideo, to_av_frame
 
 MUXERS = {".mp4": "mp4", ".mkv": "matroska"}
 # Constant quality far above the stream's own (48 dB from what was computed, on game footage), so that what is seen is the
@@ -43,7 +43,7 @@ class FileSink:
     itself, a folder that is missing or full, audio that the container cannot hold, and a second picture size.
     """
 
-    def __init__(self, path: Path, source: VideoSource, *, force: bool = False) -> None:
+    def __init__(self, path: Path, source: OpenVideo, *, force: bool = False) -> None:
         self.path = path
         self.notes: list[str] = []
         self._source, self._force = source, force
@@ -81,7 +81,7 @@ class FileSink:
         if not path.parent.is_dir():
             raise OutputError(f"cannot write {path}: the folder {path.parent} does not exist")
         if path.exists():
-            if path.samefile(self._source.path):
+            if self._source.path is not None and path.samefile(self._source.path):
                 raise OutputError(f"cannot write {path}: it is the input")
             if not path.is_file():
                 raise OutputError(f"cannot write {path}: it is not a file")
@@ -97,8 +97,8 @@ class FileSink:
 class _Encoding:
     """The encoder and the container of one output, from its first frame on."""
 
-    def __init__(self, path: Path, muxer: str, source: VideoSource, first: Frame) -> None:
-        self._source_path = source.path
+    def __init__(self, path: Path, muxer: str, source: OpenVideo, first: Frame) -> None:
+        self._source_name = source.name
         self._size = (first.width, first.height)
         self._time_base = first.time_base or source.time_base
         self._frame_ticks = max(1, round(1 / (source.frame_rate * self._time_base)))
@@ -111,23 +111,25 @@ class _Encoding:
         with contextlib.ExitStack() as stack:
             self._container = stack.enter_context(av.open(str(path.absolute()), "w", format=muxer, container_options=clocks))
             self._stream = self._add_video(source, first)
-            self._tracks = stack.enter_context(contextlib.closing(TrackCopy(source.path, self._container)))
+            self._tracks = None if source.path is None else stack.enter_context(contextlib.closing(TrackCopy(source.path, self._container)))
             self._open_files = stack.pop_all()
 
     def write(self, frame: Frame) -> None:
         if (frame.width, frame.height) != self._size:
             raise OutputError(
-                f"the picture of {self._source_path} changes in mid-stream, {self._size[0]}x{self._size[1]} becomes "
+                f"the picture of {self._source_name} changes in mid-stream, {self._size[0]}x{self._size[1]} becomes "
                 f"{frame.width}x{frame.height} upscaled, which one file cannot hold: cut it there and upscale the parts"
             )
         picture = to_av_frame(_pad_to_even(frame))
         picture.pts, picture.time_base = self._next_pts(frame.pts), self._time_base
         self._container.mux(self._stream.encode(picture))
-        self._tracks.copy_until(picture.pts * self._time_base)
+        if self._tracks:
+            self._tracks.copy_until(picture.pts * self._time_base)
 
     def finish(self) -> None:
         self._container.mux(self._stream.encode(None))
-        self._tracks.copy_until(None)
+        if self._tracks:
+            self._tracks.copy_until(None)
         self._open_files.close()
 
     def abandon(self) -> None:
@@ -144,9 +146,9 @@ class _Encoding:
             )
         if self._moved_pts:
             notes.append(f"{self._moved_pts} frames had no timestamp or one that went back: theirs follow from the frame rate")
-        return notes + self._tracks.notes()
+        return notes + (self._tracks.notes() if self._tracks else ["of a pipe the picture alone is written: no sound, no subtitles"])
 
-    def _add_video(self, source: VideoSource, first: Frame) -> VideoStream:
+    def _add_video(self, source: OpenVideo, first: Frame) -> VideoStream:
         stream = self._container.add_stream("libx264", rate=source.frame_rate, options=dict(X264_OPTIONS))
         context, tags = stream.codec_context, first.colour
         context.width, context.height = (side + side % 2 for side in self._size)

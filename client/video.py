@@ -52,6 +52,8 @@ class OpenVideo:
     interlaced, larger than 8192x8192, or of another pixel format.
     """
 
+    path: Path | None = None  # of what can be opened again
+
     def __init__(self, name: str, container: InputContainer) -> None:
         self.name = name
         self.decode_errors = 0
