@@ -35,6 +35,8 @@ class OverlayLines:
             self._at_ns, self._bytes, self._packets, self._lost = now_ns, reception.bytes, reception.packets, reception.lost
         latencies = tally.latencies(network=False, newest=_FRAMES)
         lines.append(f"{'ms':<8}{'p50':>6} {'p95':>6}")
-        lines += [f"{stage:<8}{latencies[stage].p50 / 1000:6.1f} {latencies[stage].p95 / 1000:6.1f}" for stage in _STAGES if stage in latencies]
+        lines += [
+            f"{stage:<8}{latencies[stage].p50 / 1000:6.1f} {latencies[stage].p95 / 1000:6.1f}" for stage in _STAGES if stage in latencies
+        ]
         lines.append(f"queue {self._source.waiting()}, late {tally.late}, left out {tally.left_out}, freezes {tally.freezes}")
         return lines
