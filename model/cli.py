@@ -174,7 +174,7 @@ def verify_main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--json", action="store_true", help="a JSON line a step and provider, or a hard case, instead of the table")
     parser.add_argument("--debug", action="store_true", help="show the trace of an error")
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse_intermixed_args(argv)  # options between MODEL and CLIP too
     if arguments.hard is None and (arguments.clip is None or arguments.cases):
         parser.error("CLIP may be left out, and --cases given, with --hard only")
     if arguments.hard and len(arguments.provider) > 1:
