@@ -19,7 +19,7 @@ example:
   gamesr-quantize client/weights/live_x2.onnx mine-int8 match_540p.mp4 race_540p.mp4
 
 The clips are what the artifact will be given: low resolution, compressed, of several scenes, none of them a test scene.
-fast-int8, live-int8 and balanced-int8 ship, made like this, by 2 the last two of model/originals. How much is lost and gained, and
+fast-int8, live-int8 and balanced-int8 ship, made like this, the last two of model/originals. How much is lost and gained, and
 where: docs/stability.md. To see it for a model of your own:
 
   gamesr-verify client/weights/mine-int8_x2.onnx test_540p.mp4 --provider cpu openvino
