@@ -255,7 +255,6 @@ def test_list_names_every_scene(capsys: pytest.CaptureFixture[str]) -> None:
     [
         (["list", "quake"], "there is no game, scene or split 'quake'"),
         (["render", "out", "--heights", "1080", "500"], "do not fit"),
-        (["render", "out", "--jobs", "0"], "--jobs is at least 1"),
         (["check", "out"], "holds none of these scenes"),
         (["split", "out"], "holds none of these scenes"),
         (["--games", "out", "list"], "has no game file"),

@@ -126,8 +126,6 @@ def _render(scenes: list[SceneSpec], arguments: argparse.Namespace) -> int:
         raise InputError(
             f"heights {heights} do not fit: each an even number from 36 to 2160 that 9 divides, the greatest a multiple of the others"
         )
-    if arguments.jobs < 1:
-        raise InputError("--jobs is at least 1")
     library = Library(arguments.folder)
     total = sum(scene.frames * len(library.missing(scene, shots_of(scene, heights))) for scene in scenes)
     failed = 0
