@@ -104,7 +104,7 @@ def test_a_clip_is_read_no_further_than_it_is_played(length: int, monkeypatch: p
 def test_there_is_a_step_at_least(steps: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         verify_main(["model.onnx", "clip.mkv", "--steps", steps])
-    assert "--steps is at least 1" in capsys.readouterr().err
+    assert f"--steps: {steps} is not a whole number from 1" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
