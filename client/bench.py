@@ -13,7 +13,7 @@ from pathlib import Path
 
 import onnxruntime
 
-from client.command import run_command, whole_number
+from client.command import command_parser, run_command, whole_number
 from client.measurement import WARM_UP_FRAMES, Run, Task, measure_in_fresh_process
 from client.models import find_model, shipped_models
 from client.runtime import PROVIDERS
@@ -116,12 +116,7 @@ def _pool(summaries: Sequence[LatencySummary]) -> dict[str, float]:
 
 
 def parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Time the models on this machine, stage by stage, beside bicubic and Lanczos.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_parser(PROGRAM, "Time the models on this machine, stage by stage, beside bicubic and Lanczos.", EPILOG)
     parser.add_argument(
         "--model",
         metavar="NAME|FILE",
@@ -134,7 +129,6 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--provider", choices=PROVIDERS, default="cpu", help="what runs the models (default: %(default)s)")
     parser.add_argument("--threads", metavar="N", type=whole_number(), help="threads of the model (default: the physical cores)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
-    parser.add_argument("--debug", action="store_true", help="show where an error came from")
     return parser
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from client.baselines import Baselines
-from client.command import run_command, whole_number
+from client.command import command_parser, run_command, whole_number
 from client.compare import ComparisonWriter
 from client.detail import DetailUpscaler
 from client.errors import InputError, ModelError, OutputError
@@ -48,12 +48,7 @@ network's work. Exit status: 0 done, 1 refused or failed (one sentence says why,
 
 
 def parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Upscale a game video frame by frame with a small recurrent network.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_parser(PROGRAM, "Upscale a game video frame by frame with a small recurrent network.", EXAMPLES)
     parser.add_argument("input", metavar="INPUT", type=Path, help="the video: H.264 or another codec, 8-bit, progressive; - for a pipe")
     parser.add_argument(
         "-o", "--output", metavar="OUT", type=Path, help=".mp4 or .mkv, or - for .y4m into a pipe (default: INPUT_gamesr_xSCALE beside it)"
@@ -85,7 +80,6 @@ def parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the summary")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
-    parser.add_argument("--debug", action="store_true", help="show where an error came from")
     return parser
 
 

@@ -8,9 +8,20 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
 from types import FrameType
 
 from client.errors import GamesrError
+
+
+def command_parser(program: str, description: str, epilog: str) -> argparse.ArgumentParser:
+    """A parser whose help keeps the lines of `epilog`, with the options that every command has."""
+    parser = argparse.ArgumentParser(
+        prog=program, description=description, epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--version", action="version", version=f"{program}, of GameSR {_version()}")
+    parser.add_argument("--debug", action="store_true", help="show where an error came from")
+    return parser
 
 
 def run_command(program: str, work: Callable[[], int | None], *, debug: bool, interrupted: str = "interrupted") -> int:
@@ -67,3 +78,10 @@ def _interrupt(signum: int, frame: FrameType | None) -> None:
     for each in (signal.SIGINT, signal.SIGTERM):
         signal.signal(each, signal.SIG_IGN)
     raise KeyboardInterrupt
+
+
+def _version() -> str:
+    try:
+        return version("gamesr")
+    except PackageNotFoundError:
+        return "that is not installed"

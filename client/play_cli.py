@@ -17,7 +17,7 @@ from pathlib import Path
 from types import FrameType
 
 from client.choice import AUTO, FLOAT_TIERS, INT8_TIERS, chosen_provider, chosen_tiers
-from client.command import fail, reader_gone, whole_number
+from client.command import command_parser, fail, reader_gone, whole_number
 from client.errors import GamesrError, how_to_install
 from client.pipeline import Sink
 from client.play_overlay import OverlayLines
@@ -50,12 +50,7 @@ Keys: q or Esc ends, F or F11 fullscreen, F1 the overlay, W the wipe. Exit statu
 
 
 def parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Play a live game stream, every frame upscaled in time.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_parser(PROGRAM, "Play a live game stream, every frame upscaled in time.", EXAMPLES)
     parser.add_argument("source", metavar="SOURCE", help="[HOST]:PORT to listen on, an .sdp file, a video file, or a URL such as rtsp://")
     parser.add_argument("--sink", metavar="null|window|FILE", default="window", help="nowhere, a window, or a .y4m file (default: window)")
     parser.add_argument("--fullscreen", action="store_true", help="begin with the window over the whole screen")
@@ -86,7 +81,6 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--post", metavar="URL", help="post the latencies to a gamesr-serve; its key is taken from GAMESR_API_KEY")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the summary")
     parser.add_argument("--force", action="store_true", help="replace the file if it exists")
-    parser.add_argument("--debug", action="store_true", help="show where an error came from")
     return parser
 
 

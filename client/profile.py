@@ -16,7 +16,7 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from client.artifact import ModelSpec, load_session, read_artifact, session_options
-from client.command import run_command, whole_number
+from client.command import command_parser, run_command, whole_number
 from client.cores import physical_cores
 from client.models import DEFAULT_MODEL, find_model
 from client.runtime import OPENVINO, OpenVinoRuntime
@@ -115,12 +115,7 @@ def table(parts: Sequence[Part]) -> str:
 
 
 def parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Count what each operation of a model takes on this machine.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_parser(PROGRAM, "Count what each operation of a model takes on this machine.", EPILOG)
     parser.add_argument(
         "--model", metavar="NAME|FILE", default=DEFAULT_MODEL, help="a shipped model or an .onnx file (default: %(default)s)"
     )
@@ -129,7 +124,6 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--threads", metavar="N", type=whole_number(), help="threads of the model (default: the physical cores)")
     parser.add_argument("--frames", metavar="N", type=whole_number(), default=30, help="frames that count (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="a JSON line an operation instead of the table")
-    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     return parser
 
 

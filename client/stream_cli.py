@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from client.cloud import NetworkSettings
-from client.command import run_command, whole_number
+from client.command import command_parser, run_command, whole_number
 from client.errors import OutputError, how_to_install
 from client.video import VideoSource
 from client.whole_file import write_whole
@@ -30,12 +30,7 @@ interrupted.
 
 
 def parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Stream a clip over RTP in real time, encoded as a cloud-gaming server encodes.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_parser(PROGRAM, "Stream a clip over RTP in real time, encoded as a cloud-gaming server encodes.", EXAMPLES)
     parser.add_argument("clip", metavar="CLIP", type=Path, help="the video that stands for the game")
     parser.add_argument("--to", metavar="HOST:PORT", type=_address, required=True, help="who receives it")
     parser.add_argument(
@@ -48,7 +43,6 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--loop", action="store_true", help="begin again at the end")
     parser.add_argument("--sdp", metavar="FILE", type=Path, help="write the session description for other receivers")
     parser.add_argument("--force", action="store_true", help="replace the description if it exists")
-    parser.add_argument("--debug", action="store_true", help="show where an error came from")
     return parser
 
 

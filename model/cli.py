@@ -15,7 +15,7 @@ import torch
 from tqdm import tqdm
 
 from client.artifact import load_session
-from client.command import run_command, whole_number
+from client.command import command_parser, run_command, whole_number
 from client.errors import InputError, ModelError
 from client.models import find_model
 from client.runtime import PROVIDERS
@@ -58,11 +58,10 @@ hard cases (docs/stability.md says more):
 
 def train_main(argv: Sequence[str] | None = None) -> int:
     defaults = {f.name: f.default for f in fields(TrainConfig)}
-    parser = argparse.ArgumentParser(
-        prog="gamesr-train",
-        description="Train a GameSR network, or a published one beside it, on game footage degraded as a cloud encoder degrades it.",
-        epilog=TRAIN_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = command_parser(
+        "gamesr-train",
+        "Train a GameSR network, or a published one beside it, on game footage degraded as a cloud encoder degrades it.",
+        TRAIN_EXAMPLES,
     )
     parser.add_argument("footage", type=Path, help="the footage list, a TOML file")
     parser.add_argument("run", type=Path, help="the run's folder: checkpoint.pt and log.jsonl")
@@ -113,7 +112,6 @@ def train_main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--validate-every", type=whole_number(), default=1000, metavar="STEPS", help="held-out PSNR and a checkpoint (default: %(default)s)"
     )
-    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     arguments = parser.parse_args(argv)
     names = {f.name for f in fields(TrainConfig)}
     given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in vars(arguments).items() if k in names}
@@ -140,12 +138,11 @@ def train_main(argv: Sequence[str] | None = None) -> int:
 
 
 def verify_main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="gamesr-verify",
-        description="Hold an artifact in ONNX Runtime against its own weights in torch float64, over many recurrent steps of a clip; "
+    parser = command_parser(
+        "gamesr-verify",
+        "Hold an artifact in ONNX Runtime against its own weights in torch float64, over many recurrent steps of a clip; "
         "with --hard, over pictures and states that are hard on a recurrent network. Exits 1 when it breaks a bound of its precision.",
-        epilog=VERIFY_EXAMPLES + "".join(f"  {case.name:14} {case.what}\n" for case in CASES),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        VERIFY_EXAMPLES + "".join(f"  {case.name:14} {case.what}\n" for case in CASES),
     )
     parser.add_argument(
         "model",
@@ -173,7 +170,6 @@ def verify_main(argv: Sequence[str] | None = None) -> int:
         "--weights", type=Path, metavar="FLOAT32", help="the .onnx artifact that an int8 one was made from, where that does not ship"
     )
     parser.add_argument("--json", action="store_true", help="a JSON line a step and provider, or a hard case, instead of the table")
-    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     arguments = parser.parse_intermixed_args(argv)  # options between MODEL and CLIP too
     if arguments.hard is None and (arguments.clip is None or arguments.cases):
         parser.error("CLIP may be left out, and --cases given, with --hard only")
@@ -235,11 +231,10 @@ def _verify_hard(arguments: argparse.Namespace) -> None:
 
 
 def evaluate_main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="gamesr-evaluate",
-        description="Measure models on test scenes: downscaled, encoded as a cloud encoder does, upscaled, held against the reference.",
-        epilog="example:\n  gamesr-evaluate tests/footage/footage.toml --models bicubic lanczos gamesr --scales 2",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = command_parser(
+        "gamesr-evaluate",
+        "Measure models on test scenes: downscaled, encoded as a cloud encoder does, upscaled, held against the reference.",
+        "example:\n  gamesr-evaluate tests/footage/footage.toml --models bicubic lanczos gamesr --scales 2",
     )
     parser.add_argument("footage", type=Path, help="the footage list, a TOML file")
     parser.add_argument("--split", choices=("validate", "test"), default="test", help="which scenes (default: %(default)s)")
@@ -253,7 +248,6 @@ def evaluate_main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--rows", type=Path, default=Path("runs/evaluation.jsonl"), help="measured rows, kept (default: %(default)s)")
     parser.add_argument("--cache", type=Path, default=Path("runs/cache"), help="decoded footage, may be deleted (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="a JSON line a row instead of the table")
-    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     arguments = parser.parse_args(argv)
 
     def work() -> None:

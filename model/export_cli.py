@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
 from client.artifact import load_session
-from client.command import run_command
+from client.command import command_parser, run_command
 from client.errors import InputError
 from client.models import WEIGHTS
 from model.artifact_files import new_artifacts
@@ -29,11 +28,10 @@ examples:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="gamesr-export",
-        description="Write a trained network, with its model card beside it, or a baseline, as a self-describing ONNX artifact.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = command_parser(
+        "gamesr-export",
+        "Write a trained network, with its model card beside it, or a baseline, as a self-describing ONNX artifact.",
+        EPILOG,
     )
     parser.add_argument("weights", help=f"a run's checkpoint.pt; or {', '.join(BASELINES)}, for both scales")
     parser.add_argument("name", help="the model's name; its files are NAME_xSCALE.onnx and, of a trained network, .md")
@@ -45,7 +43,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="take this share of the weights from the .onnx artifact that the run began from",
     )
     parser.add_argument("--force", action="store_true", help="replace files that exist")
-    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     arguments = parser.parse_args(argv)
 
     def paths_of(*scales: int) -> list[Path]:

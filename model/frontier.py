@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 from tqdm import tqdm
 
-from client.command import run_command, whole_number
+from client.command import command_parser, run_command, whole_number
 from client.errors import InputError
 from client.measurement import WARM_UP_FRAMES, Task, measure_in_fresh_process
 from client.models import find_model
@@ -222,12 +222,7 @@ def _rows(names: Sequence[str], provider: str, arguments: argparse.Namespace) ->
 
 
 def parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Milliseconds against decibels: which models on which runtimes no other beats.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_parser(PROGRAM, "Milliseconds against decibels: which models on which runtimes no other beats.", EPILOG)
     parser.add_argument("footage", type=Path, help="the footage list, a TOML file; its test scenes are used")
     parser.add_argument("--models", nargs="+", default=["lanczos", "live", "gamesr"], metavar="NAME|FILE", help="beside bicubic")
     parser.add_argument("--providers", nargs="+", choices=PROVIDERS, default=["cpu"], help="runtimes (default: cpu)")
@@ -246,7 +241,6 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--cache", type=Path, default=Path("runs/cache"), help="decoded footage, may be deleted (default: %(default)s)")
     parser.add_argument("--svg", type=Path, metavar="FILE", help="draw it")
     parser.add_argument("--json", action="store_true", help="a JSON line for each model on each runtime instead of the tables")
-    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     return parser
 
 

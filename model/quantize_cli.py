@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from client.command import run_command, whole_number
+from client.command import command_parser, run_command, whole_number
 from client.models import WEIGHTS, find_model
 from client.upscaler import OnnxUpscaler
 from model.artifact_files import new_artifacts
@@ -30,11 +29,8 @@ where: docs/stability.md. To see it for a model of your own:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="gamesr-quantize",
-        description="Write an int8 artifact of a float32 one, its ranges calibrated on footage, its model card beside it.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = command_parser(
+        "gamesr-quantize", "Write an int8 artifact of a float32 one, its ranges calibrated on footage, its model card beside it.", EPILOG
     )
     parser.add_argument("model", metavar="NAME|FILE", help="a shipped float32 model, or the .onnx artifact of a trained GameSR network")
     parser.add_argument("name", help="the new model's name; its files are NAME_xSCALE.onnx and .md")
@@ -51,7 +47,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--folder", type=Path, default=WEIGHTS, help="where to (default: %(default)s)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
-    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     arguments = parser.parse_args(argv)
 
     def work() -> None:

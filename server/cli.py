@@ -12,7 +12,7 @@ from contextlib import ExitStack, closing
 from importlib.util import find_spec
 from pathlib import Path
 
-from client.command import run_command, whole_number
+from client.command import command_parser, run_command, whole_number
 from client.cores import physical_cores
 from client.errors import GamesrError, OutputError, how_to_install
 from client.whole_file import write_whole
@@ -61,12 +61,7 @@ Exit status: 0 done, 1 refused or something failed (one sentence says why; what 
 
 
 def parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Measure what upscaling on the client buys in bits, and what it costs in milliseconds.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_parser(PROGRAM, "Measure what upscaling on the client buys in bits, and what it costs in milliseconds.", EXAMPLES)
     parser.add_argument("clips", metavar="CLIP", nargs="+", type=Path, help="a video in full size, which everything is measured against")
     parser.add_argument(
         "--bitrates", metavar="MBPS,...", type=_megabits, default="2,4,6,8,13,20,25", help="megabits a second (default: %(default)s)"
@@ -116,7 +111,6 @@ def parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--force", action="store_true", help="write into a folder that is not empty")
     parser.add_argument("--json", action="store_true", help="print every event as one line of JSON instead of the summary")
-    parser.add_argument("--debug", action="store_true", help="show where an error came from")
     return parser
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from statistics import median
 
 from client.cloud import NetworkSettings
-from client.command import run_command, whole_number
+from client.command import command_parser, run_command, whole_number
 from client.errors import InputError, OutputError, how_to_install
 from client.models import find_model
 from client.progress import clock
@@ -118,12 +118,7 @@ HEADS = ("encoded", "link", "packets lost", "shown", "damaged", "freezes (longes
 
 
 def parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Measure what a network that loses does to a stream, and what each upscaler makes of it.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_parser(PROGRAM, "Measure what a network that loses does to a stream, and what each upscaler makes of it.", EPILOG)
     parser.add_argument("clip", metavar="CLIP", type=Path, help="a video at full size, which everything is measured against")
     parser.add_argument(
         "--height", metavar="N", type=whole_number(most=100_000), default=540, help="height that is sent (default: %(default)s)"
@@ -138,7 +133,6 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", metavar="FILE.svg", type=Path, help=f"draw PSNR over time ({drawn}) into a file")
     parser.add_argument("--force", action="store_true", help="replace that file if it exists")
     parser.add_argument("--json", action="store_true", help="print one JSON object a row instead of the table")
-    parser.add_argument("--debug", action="store_true", help="show where an error came from")
     return parser
 
 

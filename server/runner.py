@@ -11,13 +11,14 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Iterator, Sequence
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from client.command import fail, whole_number
+from client.command import command_parser, fail, whole_number
 from client.cores import physical_cores
 from client.errors import GamesrError, OutputError
 from server.database import Database
@@ -106,11 +107,8 @@ class RunnerProcess:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Run the sweeps that wait for a gamesr-serve that was started with --no-runner on the same folder and store.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = command_parser(
+        PROGRAM, "Run the sweeps that wait for a gamesr-serve that was started with --no-runner on the same folder and store.", EXAMPLES
     )
     add_folders(parser)
     arguments = parser.parse_args(argv)
@@ -125,6 +123,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         return fail(PROGRAM, f"cannot use {settings.data}: {error.strerror}")
     except GamesrError as error:
+        if arguments.debug:
+            traceback.print_exc()
         return fail(PROGRAM, str(error))
     return 0
 

@@ -16,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 
+from client.command import command_parser
 from client.errors import GamesrError, InputError, OutputError, how_to_install
 from server.guards import is_loopback
 from server.runner import RunnerProcess, add_folders
@@ -42,18 +43,12 @@ put a proxy in front of it. Exit status: 0 ended, 1 refused (one sentence says w
 
 
 def parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Serve what sweeps measured, as JSON, as Prometheus metrics and as a page.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_parser(PROGRAM, "Serve what sweeps measured, as JSON, as Prometheus metrics and as a page.", EXAMPLES)
     add_folders(parser)
     parser.add_argument("--host", metavar="ADDRESS", default="127.0.0.1", help="where to listen (default: %(default)s)")
     parser.add_argument("--port", metavar="N", type=_port, default=8060, help="the port there (default: %(default)s)")
     parser.add_argument("--demo", action="store_true", help="open on the sample sweep, in a folder that is removed at the end")
     parser.add_argument("--no-runner", action="store_true", help="sweeps are run by a gamesr-runner, elsewhere on the same folders")
-    parser.add_argument("--debug", action="store_true", help="show where an error came from")
     return parser
 
 

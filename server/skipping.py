@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from client.cloud import CloudSettings, area_downscale
-from client.command import run_command, whole_number
+from client.command import command_parser, run_command, whole_number
 from client.errors import InputError
 from client.frames import Frame
 from client.models import DEFAULT_MODEL, find_model
@@ -200,12 +200,7 @@ def measure(clip: str, frames: list[Frame], scene: Scene, rate_control: str, kbp
 
 
 def parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Measure what skipping unchanged tiles saves and costs.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_parser(PROGRAM, "Measure what skipping unchanged tiles saves and costs.", EPILOG)
     parser.add_argument("clips", metavar="CLIP", nargs="+", type=Path, help="a clip at full size, at least 8 frames")
     parser.add_argument("--model", metavar="NAME|FILE", default=DEFAULT_MODEL, help="a shipped x2 model or a file (default: %(default)s)")
     parser.add_argument("--provider", choices=PROVIDERS, default="cpu", help="what runs the model (default: %(default)s)")
@@ -218,7 +213,6 @@ def parser() -> argparse.ArgumentParser:
         help="bitrate of CBR and intra-refresh (default: %(default)s)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object a row instead of the table")
-    parser.add_argument("--debug", action="store_true", help="show where an error came from")
     return parser
 
 

@@ -19,3 +19,11 @@ def test_help_says_how_to_use_it(command: str, capsys: pytest.CaptureFixture[str
     said = capsys.readouterr().out
     assert exit_.value.code == 0 and said.startswith(f"usage: {command}") and "--help" in said
     assert "example" in said
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_it_says_its_version(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    module, function = COMMANDS[command].split(":")
+    with pytest.raises(SystemExit) as exit_:
+        getattr(importlib.import_module(module), function)(["--version"])
+    assert exit_.value.code == 0 and capsys.readouterr().out.startswith(f"{command}, of GameSR ")

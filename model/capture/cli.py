@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from client.command import run_command, whole_number
+from client.command import command_parser, run_command, whole_number
 from client.cores import physical_cores
 from client.errors import InputError
 from model.capture.display import hidden_display
@@ -41,14 +41,8 @@ Exit status: 0 done, 1 refused or failed (one sentence says why), 2 wrong usage,
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Film free games frame by frame, at several resolutions from the same camera path.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_parser(PROGRAM, "Film free games frame by frame, at several resolutions from the same camera path.", EPILOG)
     parser.add_argument("--games", type=Path, default=GAMES, metavar="FOLDER", help="the game files (default: those that ship)")
-    parser.add_argument("--debug", action="store_true", help="show the trace of an error")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     add = _adder(commands)
     listing = add("list", _list, "show games and scenes", folder=False)
