@@ -16,10 +16,10 @@ CLIP = ROOT / "tests/footage/oa_koth1_540p.mp4"
 
 
 @contextmanager
-def streamed(address: str) -> Iterator[None]:
+def streamed(address: str, *, fps: int = 60) -> Iterator[None]:
     """gamesr-stream in a process of its own sends the clip that ships here to HOST:PORT, over and over."""
     program = "import sys; from client.stream_cli import main; sys.exit(main())"
-    command = [sys.executable, "-c", program, str(CLIP), "--to", address, "--copy", "--loop"]
+    command = [sys.executable, "-c", program, str(CLIP), "--to", address, "--copy", "--loop", "--fps", str(fps)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as sender:
         try:
             yield
