@@ -95,7 +95,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         said = sys.stderr if summary.output == PIPE else sys.stdout
         print(json.dumps(summary.record()) if arguments.json else summary.text(), file=said, flush=True)
 
-    return run_command(PROGRAM, work, debug=arguments.debug, interrupted="interrupted, nothing was written")
+    interrupted = "interrupted" if arguments.output == PIPE else "interrupted, nothing was written"
+    return run_command(PROGRAM, work, debug=arguments.debug, interrupted=interrupted)
 
 
 def upscale(arguments: argparse.Namespace) -> Summary:

@@ -30,4 +30,4 @@ class ProviderError(GamesrError):
 
 def how_to_install(*extras: str) -> str:
     """What to do where an extra is missing: the end of a sentence. No package index has a GameSR, so no name on one is advised."""
-    return f"in the folder of its source, pip install -c constraints.txt '.[{','.join(extras)}]'"
+    return f"in the folder of GameSR's source, pip install -c constraints.txt '.[{','.join(extras)}]'"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
 from pathlib import Path
 from typing import BinaryIO
 
@@ -41,11 +40,10 @@ class PipeSink:
 
     def write(self, frame: Frame) -> None:
         if self._writer is None:
-            ratio = Fraction(self._source.sample_aspect_ratio)
-            self._writer = Y4mWriter(self._pipe, frame, Fraction(self._source.frame_rate), sample_aspect_ratio=ratio)
+            source = self._source
+            self._writer = Y4mWriter(self._pipe, frame, source.frame_rate, sample_aspect_ratio=source.sample_aspect_ratio)
             self._size = frame.width, frame.height
         if (frame.width, frame.height) != self._size:
-            raise OutputError(
-                f"the picture changes in mid-stream, {self._size} becomes {(frame.width, frame.height)}, which .y4m cannot hold"
-            )
+            before, now = (f"{width}x{height}" for width, height in (self._size, (frame.width, frame.height)))
+            raise OutputError(f"the picture changes in mid-stream, {before} becomes {now} upscaled, which .y4m cannot hold")
         self._writer.picture(frame)

@@ -50,6 +50,8 @@ class TrackCopy:
         except ValueError as error:  # FFmpeg's "Invalid argument" is one too
             names = ", ".join(stream.name or "unknown" for stream in self._container.streams.audio)
             self._container.close()
+            if not names:
+                raise
             matroska = output.format.name == "matroska"
             advice = f"leave it out with ffmpeg -i {path} -c copy -an, and upscale that" if matroska else "write to .mkv instead"
             raise OutputError(f"{output.format.name} cannot hold the audio of {path} ({names}): {advice}") from error

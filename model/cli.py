@@ -76,18 +76,16 @@ def train_main(argv: Sequence[str] | None = None) -> int:
         help="area, native, native:aa (against the anti-aliased reference), area@4000 (x264 at 4000 kbps)...; twice is twice as often "
         "(default: %(default)s)",
     )
-    for name, text in (
-        ("steps", "optimizer updates"),
-        ("batch", "clips in a batch"),
-        ("patch", "side of a crop in low-resolution pixels"),
-        ("frames", "frames of a clip, over which the state is carried"),
-        ("window", "frames of one step, through which gradients flow"),
-        ("halvings", "how often the learning rate is halved over the run"),
-        ("seed", "of weights and crops"),
+    for name, least, text in (
+        ("steps", 1, "optimizer updates"),
+        ("batch", 1, "clips in a batch"),
+        ("patch", 1, "side of a crop in low-resolution pixels"),
+        ("frames", 1, "frames of a clip, over which the state is carried"),
+        ("window", 1, "frames of one step, through which gradients flow"),
+        ("halvings", 0, "how often the learning rate is halved over the run"),
+        ("seed", 0, "of weights and crops"),
     ):
-        parser.add_argument(
-            f"--{name}", type=whole_number(0 if name == "seed" else 1), default=defaults[name], help=f"{text} (default: %(default)s)"
-        )
+        parser.add_argument(f"--{name}", type=whole_number(least), default=defaults[name], help=f"{text} (default: %(default)s)")
     parser.add_argument("--learning-rate", type=float, default=defaults["learning_rate"], help="AdamW's first rate (default: %(default)s)")
     parser.add_argument(
         "--loss",

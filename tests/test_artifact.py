@@ -54,7 +54,11 @@ def state_entry(**changes: object) -> str:
         ({"state": state_entry(channels=10**9)}, "has 1000000000 channels"),
         ({"state": state_entry(divisor=0)}, "at 1/0 of the size"),
         ({"state": state_entry(channels="1")}, "has 1 channels"),
+        ({"state": state_entry(dtype=[])}, "not short words"),
+        ({"state": state_entry(input="\x1b[31m")}, "not short words"),
         ({"card": "[1]"}, "metadata is incomplete or wrong"),
+        ({"card": "[" * 100_000 + "]" * 100_000}, "metadata is incomplete or wrong"),
+        ({"card": '{"parameters": "many"}'}, "its card's parameters is not a whole number"),
     ],
 )
 def test_metadata_that_is_not_understood_is_refused(model_file: ModelFile, metadata: dict[str, str | None], reason: str) -> None:

@@ -250,6 +250,12 @@ def test_list_names_every_scene(capsys: pytest.CaptureFixture[str]) -> None:
     assert "openarena/oa_koth1" in capsys.readouterr().out
 
 
+def test_no_game_at_a_time_is_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["render", "out", "--jobs", "0"])
+    assert ended.value.code == 2 and "--jobs: 0 is not a whole number from 1" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

@@ -159,6 +159,19 @@ def test_an_artifact_named_twice_is_measured_once(workshop: Path, capsys: pytest
     assert len(capsys.readouterr().out.splitlines()) == len((workshop / "twice.jsonl").read_text().splitlines()) == 1
 
 
+def test_evaluate_knows_a_row_by_its_footage_and_not_by_the_scenes_name(
+    workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    again = ["--cache", str(tmp_path / "cache"), "--rows", str(tmp_path / "rows.jsonl"), "--models", "bicubic", "--scales", "2", "--json"]
+    found = []
+    footage = write_footage(tmp_path)
+    for film in ("clip.mkv", "native.mkv"):
+        (tmp_path / film).replace(tmp_path / "clip.mkv")
+        assert evaluate_main([str(footage), "--degradations", "area", "--frames", "4", *again]) == 0
+        found.append(json.loads(capsys.readouterr().out))
+    assert found[0]["clip"] == found[1]["clip"] and found[0]["psnr_y_db"] != found[1]["psnr_y_db"]
+
+
 def test_evaluate_measures_each_row_once(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = [str(workshop / "footage.toml"), "--cache", str(workshop / "cache"), "--rows", str(workshop / "rows.jsonl")]
     command += [

@@ -180,6 +180,15 @@ def test_subtitles_chapters_and_names_are_kept_where_they_can_be(make_clip: Make
     assert notes == {"mkv": [], "mp4": ["subtitle track 1 (srt) is left out: mp4 cannot hold it"]}
 
 
+def test_audio_is_not_blamed_for_what_else_cannot_be_encoded(
+    make_clip: MakeClip, upscaler: OnnxUpscaler, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("client.sink.X264_OPTIONS", {"profile": "nonsense"})
+    with pytest.raises(OutputError, match=r"^cannot write .*out\.mp4: ") as error:
+        through(make_clip(), upscaler, tmp_path / "out.mp4")
+    assert "cannot hold" not in str(error.value)
+
+
 def test_a_title_that_is_not_utf8_keeps_nobody_from_its_video(make_clip: MakeClip, upscaler: OnnxUpscaler, tmp_path: Path) -> None:
     clip = make_clip("plain.mkv")
     with av.open(str(clip)) as film, av.open(str(tmp_path / "old.mkv"), "w") as container:

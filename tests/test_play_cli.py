@@ -17,7 +17,7 @@ from client import play_cli
 from client.choice import chosen_provider, chosen_tiers
 from client.errors import OutputError
 from client.frames import Frame
-from client.play_post import PATH, post_summary
+from client.play_post import KEY_VARIABLE, PATH, post_summary
 from client.upscaler import OnnxUpscaler
 from client.video import read_frames
 from client.window import Action, Window
@@ -247,6 +247,22 @@ def test_a_summary_goes_to_the_address_and_through_no_proxy(monkeypatch: pytest.
     with answering(Collects) as address:
         post_summary(address, {})
     assert [path for path, _, _ in Collects.taken] == [PATH]
+
+
+def test_a_key_may_end_in_a_new_line_and_is_never_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(KEY_VARIABLE, "sixteen letters!\n")
+    with answering(Collects) as address:
+        post_summary(address, {})
+    monkeypatch.setenv(KEY_VARIABLE, "s3cret\nHost: elsewhere")
+    with pytest.raises(OutputError, match=KEY_VARIABLE) as error:
+        post_summary("http://127.0.0.1:1", {})
+    assert "s3cret" not in str(error.value)
+
+
+@pytest.mark.parametrize("host", ["a..b", "x" * 64])
+def test_what_is_no_name_of_a_host_is_one_sentence(play: Play, host: str) -> None:
+    status, _, errors = play(f"{host}:5004")
+    assert status == 1 and f"{host} is no address to listen on" in errors and errors.count("\n") == 1
 
 
 def test_the_windows_title_holds_no_password(play: Play, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -257,3 +257,11 @@ def test_a_picture_is_upscaled_by_the_pipeline_of_the_users(clip: Path, tmp_path
     monkeypatch.setattr(server.job, "upscale_stream", spied)
     sweep_here(plan_of(clip, upscalers="none,bicubic", heights=[36], bitrates=[200]), tmp_path / "store")
     assert len(seen) == 1 and np.shape(seen) == (1, 3)
+
+
+@pytest.mark.parametrize("scale", [2, 16, 17, 30])
+def test_a_flat_picture_stays_what_it_is_by_any_scale(scale: int) -> None:
+    """The largest blocks come to sums that 16 bits do not hold."""
+    side = 4 * scale
+    small = area_downscale(Frame(*(np.full((n, n), 255, np.uint8) for n in (side, side // 2, side // 2))), scale)
+    assert [set(plane.ravel()) for plane in (small.y, small.u, small.v)] == [{255}] * 3

@@ -13,7 +13,7 @@ import numpy as np
 import psutil
 import pytest
 
-from client.errors import OutputError
+from client.errors import OutputError, how_to_install
 from client.window import Action, Window
 from tests.windows import flat, native, noise, pixels, press, push, resize, sdl2
 
@@ -149,7 +149,9 @@ def test_no_display_is_one_sentence(monkeypatch: pytest.MonkeyPatch, driver: str
 
 def test_no_library_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "sdl2", None)
-    with pytest.raises(OutputError, match=r"^no window can be opened without .*pip install -c .* '\.\[play\]'.*libsdl2-2\.0-0[^\n]*$"):
+    with pytest.raises(
+        OutputError, match=rf"^no window can be opened without .*{re.escape(how_to_install('play'))}.*libsdl2-2\.0-0[^\n]*$"
+    ):
         Window("test")
 
 
