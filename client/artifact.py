@@ -11,6 +11,7 @@ from typing import Any
 
 import onnxruntime as ort
 
+from client.cuda import CUDA, EXECUTION_PROVIDER, cuda_session
 from client.errors import ModelError, ProviderError, how_to_install
 
 FORMAT = "1"
@@ -18,7 +19,7 @@ MAX_FILE_BYTES = 64 * 2**20
 MAX_WORD = 64  # characters of a name
 MAX_STATE_CHANNELS = 4096
 MAX_REACH = 2048
-ORT_PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
+ORT_PROVIDERS = {"cpu": "CPUExecutionProvider", **dict.fromkeys(CUDA, EXECUTION_PROVIDER)}
 _TENSOR_TYPES = {"float32": "tensor(float)", "float16": "tensor(float16)"}
 
 
@@ -63,19 +64,19 @@ def load_session(model: Path, provider: str, threads: int) -> tuple[ort.Inferenc
     """
     _check_provider(provider)
     content = read_artifact(model)
-    try:
-        session = ort.InferenceSession(content, session_options(threads), providers=[ORT_PROVIDERS[provider]])
+    try:  # first where every graph runs: whether a model can be read is not a question of the GPU
+        session = ort.InferenceSession(content, session_options(threads), providers=[ORT_PROVIDERS["cpu"]])
     except Exception as error:  # the runtime's exceptions have no common base
         raise ModelError(
             f"{model} is not a readable ONNX model: it is damaged, of another kind, or newer than ONNX Runtime {ort.__version__}"
         ) from error
-    if ORT_PROVIDERS[provider] not in session.get_providers():
-        raise ProviderError(f"ONNX Runtime could not start its {provider} provider: check the driver, or use --provider cpu")
     try:
         spec = _read_spec(session.get_modelmeta().custom_metadata_map, hashlib.sha256(content).hexdigest())
         _check_tensors(session, spec)
     except _NotUnderstood as reason:
         raise ModelError(f"{model} is not a model that this client understands: {reason}") from None
+    if provider in CUDA:
+        session = cuda_session(content, session_options(threads), provider)
     return session, spec
 
 
@@ -86,7 +87,7 @@ class _NotUnderstood(Exception):
 def _check_provider(provider: str) -> None:
     if ORT_PROVIDERS[provider] not in ort.get_available_providers():
         other = "pip uninstall onnxruntime onnxruntime-gpu, then, "  # both install the same module
-        raise ProviderError(f"this ONNX Runtime has no {provider} provider: {other}{how_to_install(provider)}")
+        raise ProviderError(f"this ONNX Runtime has no cuda provider: {other}{how_to_install('cuda')}")
 
 
 def read_artifact(model: Path) -> bytes:

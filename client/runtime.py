@@ -14,6 +14,7 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from client.artifact import ORT_PROVIDERS, ModelSpec, load_session, read_artifact
+from client.cuda import CUDA
 from client.errors import ModelError, ProviderError, how_to_install
 from client.norms import norms_in_place
 from client.precise import states_in_float32
@@ -64,7 +65,7 @@ def load_runtime(model: Path, provider: str, threads: int) -> tuple[Runtime, Mod
         raise ProviderError(f"there is no provider {provider!r}: choose one of {', '.join(PROVIDERS)}")
     if provider not in OPENVINO:
         session, spec = load_session(model, provider, threads)
-        return OrtRuntime(session, "cuda" if provider == "cuda" else "cpu"), spec
+        return OrtRuntime(session, "cuda" if provider in CUDA else "cpu"), spec
     openvino()  # whether it is there is said before anything is read
     _, spec = load_session(model, "cpu", 1)
     return OpenVinoRuntime(read_artifact(model), threads=threads, provider=provider), spec

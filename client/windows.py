@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from client.cuda import CUDA
 from client.errors import ModelError, ProviderError
 from client.frames import Frame
 from client.runtime import OPENVINO
@@ -14,7 +15,7 @@ from client.upscaler import OnnxUpscaler, State
 
 def can_run_windows(upscaler: OnnxUpscaler) -> bool:
     """Whether the runtime takes windows of any size, and the state, where there is one, is in the processor's memory."""
-    return upscaler.provider not in OPENVINO and not (upscaler.provider == "cuda" and upscaler.spec.state)
+    return upscaler.provider not in OPENVINO and not (upscaler.provider in CUDA and upscaler.spec.state)
 
 
 def windowed_reach(upscaler: OnnxUpscaler) -> int:

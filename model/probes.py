@@ -10,6 +10,7 @@ from time import perf_counter_ns
 import numpy as np
 from numpy.typing import NDArray
 
+from client.cuda import TF32
 from client.errors import ProviderError
 from client.frames import Frame
 from client.runtime import BFLOAT16, FLOAT16, PROVIDERS, is_installed
@@ -124,7 +125,7 @@ def providers(subject: Subject, steps: int) -> Outcome:
     upscalers: list[OnnxUpscaler] = []
     refused: list[str] = []
     for name in PROVIDERS:
-        if name not in (BFLOAT16, FLOAT16) and is_installed(name):
+        if name not in (BFLOAT16, FLOAT16, TF32) and is_installed(name):
             try:
                 upscalers.append(OnnxUpscaler(subject.path, provider=name))
             except ProviderError as error:  # a runtime for a GPU where there is none says nothing about the artifact

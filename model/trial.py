@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from client.artifact import ModelSpec
+from client.cuda import TF32
 from client.errors import ModelError
 from client.frames import Frame
 from client.runtime import BFLOAT16, FLOAT16
@@ -54,7 +55,7 @@ BOUNDS = {
 
 def bounds_of(spec: ModelSpec, provider: str) -> Bounds:
     """Those of what it computes in: int8 is the coarsest wherever it runs. Raises ModelError for a precision that has none."""
-    coarser = {BFLOAT16: "bfloat16", FLOAT16: "float16"}
+    coarser = {BFLOAT16: "bfloat16", FLOAT16: "float16", TF32: "float16"}  # TF32 has float16's bits and float32's range
     precision = coarser.get(provider, spec.precision) if spec.precision == "float32" else spec.precision
     if precision not in BOUNDS:
         raise ModelError(f"no bounds are stated for the precision {precision} of {spec.name}")

@@ -110,7 +110,7 @@ class ClientLatencyRequest(Sent):
     model: Annotated[str, Field(pattern=NAME)]
     model_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     precision: Annotated[str, Field(pattern=NAME)] = "float32"
-    provider: Literal["cpu", "cuda", "openvino", "openvino-bfloat16", "openvino-float16"]
+    provider: Literal["cpu", "cuda", "cuda-tf32", "openvino", "openvino-bfloat16", "openvino-float16"]
     threads: Annotated[WholeNumber, Field(ge=1, le=1024)]
     machine: Word
     low_width: Annotated[WholeNumber, Field(ge=1, le=8192)]

@@ -122,7 +122,7 @@ def test_a_missing_provider_names_what_to_install(model_file: ModelFile, monkeyp
     monkeypatch.setattr(ort, "get_available_providers", lambda: ["CPUExecutionProvider"])
     with pytest.raises(ProviderError, match=r"pip uninstall onnxruntime .*pip install -c constraints.txt '\.\[cuda\]'"):
         OnnxUpscaler(model_file(), provider="cuda")
-    with pytest.raises(ProviderError, match="no provider 'tpu': choose one of cpu, cuda, openvino, openvino-bfloat16"):
+    with pytest.raises(ProviderError, match="no provider 'tpu': choose one of cpu, cuda, cuda-tf32, openvino, openvino-bfloat16"):
         OnnxUpscaler(model_file(), provider="tpu")
 
 
