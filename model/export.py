@@ -14,12 +14,11 @@ from typing import Any
 import onnx
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from model.artifact_files import Page, write_artifact
 from model.complexity import macs, parameter_count
 from model.fsr1 import SHARPNESS_STOPS, Fsr1
-from model.interpolation import MIDDLES, Interpolation, chroma_shift
+from model.interpolation import MIDDLES, Interpolation, chroma_shift, shuffle_channels_last
 from model.planes import Network, Planes, State
 from model.reach import network_reach, reach
 
@@ -52,8 +51,8 @@ class Baseline(nn.Module):
 
     def samples(self, frame: Planes, finish: Callable[[Tensor], Tensor] = lambda samples: samples) -> Planes:
         y, u, v = (plane - middle for plane, middle in zip(frame, MIDDLES, strict=True))
-        luma = F.pixel_shuffle(finish(self.luma(y) + MIDDLES[0]), 2 * self.side)
-        chroma = F.pixel_shuffle(finish(self.chroma(torch.cat((u, v))) + MIDDLES[1]), self.side)
+        luma = shuffle_channels_last(finish(self.luma(y) + MIDDLES[0]), 2 * self.side)
+        chroma = shuffle_channels_last(finish(self.chroma(torch.cat((u, v))) + MIDDLES[1]), self.side)
         return Planes(luma, chroma[:1], chroma[1:])
 
 

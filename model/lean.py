@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from model.interpolation import LearnedInterpolation, chroma_shift, exact
+from model.interpolation import LearnedInterpolation, chroma_shift, exact, shuffle_channels_last
 from model.planes import INPUT_GAIN, RESIDUAL_GAIN, Network, Planes, State
 from model.reparam import LinearTriple, fuse, load_fused
 
@@ -254,17 +254,6 @@ def weight_and_bias(conv: nn.Module) -> tuple[Tensor, Tensor]:
     """Those of a convolution, in float64."""
     assert isinstance(conv, nn.Conv2d) and conv.bias is not None
     return conv.weight.detach().double(), conv.bias.detach().double()
-
-
-def shuffle_channels_last(cells: Tensor, block: int, planes: int = 1) -> Tensor:
-    """PixelShuffle, (N, planes*block^2, h, w) to (N, planes, block*h, block*w), by way of the layout that convolutions leave.
-
-    There it moves rows of `block` samples; OpenVINO's DepthToSpace takes twice as long.
-    """
-    n, _, h, w = cells.shape
-    rows = cells.permute(0, 2, 3, 1).reshape(n, h, w, *([planes] if planes > 1 else []), block, block)
-    order = (0, 3, 1, 4, 2, 5) if planes > 1 else (0, 1, 3, 2, 4)
-    return rows.permute(order).reshape(n, planes, block * h, block * w)
 
 
 def block_diagonal(kernels: list[Tensor]) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from model.colour import PlanesToRgb, RgbToPlanes
-from model.interpolation import MIDDLES, Interpolation, LearnedInterpolation, chroma_shift
+from model.interpolation import MIDDLES, Interpolation, LearnedInterpolation, chroma_shift, shuffle_channels_last
 from model.planes import INPUT_GAIN, RESIDUAL_GAIN, Network, Planes, State
 from model.reparam import LinearTriple
 
@@ -238,4 +238,4 @@ class GameSR(Network):
         cells = base + (255 * RESIDUAL_GAIN * self.head(features).to(base.dtype) + self.middles)
         n, m = side**2, (side // 2) ** 2
         parts = zip(torch.split(finish(cells), [n, m, m], 1), (side, side // 2, side // 2), strict=True)
-        return Planes(*(F.pixel_shuffle(part, block) for part, block in parts))
+        return Planes(*(shuffle_channels_last(part, block) for part, block in parts))

@@ -7,8 +7,10 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
+import onnx
 import openvino
 import pytest
+from onnx import TensorProto, shape_inference
 
 from client.cloud import area_downscale
 from client.frames import Frame
@@ -53,6 +55,15 @@ def test_every_model_that_the_readme_names_ships() -> None:
     names = (*UNTRAINED, *NETWORKS, *(f"{name}-int8" for name in IN_INT8))
     expected = {f"{name}_x{scale}" for name in names for scale in (2, 3)}
     assert {path.stem for path in shipped_models()} == expected
+
+
+@pytest.mark.parametrize("path", shipped_models(), ids=lambda path: path.stem)
+def test_no_shipped_model_leaves_the_gpu_in_the_middle_of_a_frame(path: Path) -> None:
+    """ONNX Runtime has no CUDA kernel of DepthToSpace for uint8: it would copy the samples to the processor and shuffle them there."""
+    graph = shape_inference.infer_shapes(onnx.load(path)).graph
+    types = {value.name: value.type.tensor_type.elem_type for value in (*graph.value_info, *graph.input, *graph.output)}
+    shuffled = [types[node.input[0]] for node in graph.node if node.op_type == "DepthToSpace"]
+    assert TensorProto.UINT8 not in shuffled
 
 
 @pytest.mark.parametrize("path", shipped_models(), ids=lambda path: path.stem)
