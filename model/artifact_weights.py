@@ -25,6 +25,12 @@ def averaging(card: dict[str, Any]) -> str:
     return f"{card['share']:.0%} of the weights are those of the artifact {card['with']} (SHA-256), from which the run began"
 
 
+def refitting(card: dict[str, Any]) -> str:
+    """What a card's `refit` says, in words."""
+    inputs = " ".join(card["degradations"])
+    return f"the last layer is solved on the first {card['frames']} frames of each scene ({inputs}), commit {card['commit']}"
+
+
 def network_of_artifact(artifact: Path, weights: Path | None = None) -> Network:
     """The fused network in float64 with an artifact's weights; raises ModelError when the artifact is not the network that it says.
 
@@ -79,6 +85,8 @@ def run_of_artifact(artifact: Path) -> dict[str, Any]:
     runs = [*card.get("before", ()), {name: card[name] for name in RUN if name in card}]
     if "averaged" in card:
         runs.append({"command": averaging(card["averaged"]), "steps": 0, "training_seconds": 0})
+    if "refit" in card:
+        runs.append({"command": refitting(card["refit"]), "steps": 0, "training_seconds": 0})
     return {
         "network": network.state_dict(),
         "before": [run for run in runs if run.keys() == set(RUN)],

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from client.errors import ModelError
-from model.artifact_weights import averaging
+from model.artifact_weights import averaging, refitting
 from model.train import TrainConfig
 
 Card = dict[str, Any]
@@ -67,7 +67,10 @@ def _lines(name: str, scale: int, card: Card) -> list[str]:
         made_from = [f"- Quantized from the float32 artifact {card['quantized_from']} (SHA-256) on {', '.join(card['calibration'])}"]
     if "averaged" in card:
         made_from.append(f"- Averaged: {averaging(card['averaged'])}")
-    changed = " and ".join(done for key, done in (("averaged", "averaged"), ("quantized_from", "quantized")) if key in card)
+    if "refit" in card:
+        made_from.append(f"- Refitted: {refitting(card['refit'])}, of {', '.join(card['refit']['scenes'])}")
+    steps = (("averaged", "averaged"), ("refit", "refitted"), ("quantized_from", "quantized"))
+    changed = " and ".join(done for key, done in steps if key in card)
     earlier = [
         f"- Built on: `{run['command']}`, {run['steps']:,} steps in {run['training_seconds'] / 3600:.2f} h" for run in card["before"]
     ]

@@ -143,10 +143,10 @@ class Take:
 
 
 class FootageCache:
-    """Decodes and degrades every scene once, into a folder that may be deleted at any time."""
+    """Decodes and degrades every scene once, or its first `frames`, into a folder that may be deleted at any time."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, frames: int | None = None) -> None:
+        self.folder, self.frames = folder, frames
         folder.mkdir(parents=True, exist_ok=True)
 
     def reference(self, scene: Scene, *, antialiased: bool = False) -> Take:
@@ -179,10 +179,14 @@ class FootageCache:
         return self._take(key, frames)
 
     def _take(self, key: dict[str, object], frames: Callable[[], Iterable[Frame]]) -> Take:
+        if self.frames is not None:
+            key["frames"] = self.frames
         digest = hashlib.sha256(json.dumps([CACHE_VERSION, key], sort_keys=True).encode()).hexdigest()[:24]
         path = self.folder / f"{digest}.npy"
         if not path.exists():
-            rows = [np.concatenate([plane.reshape(-1) for plane in (f.y, f.u, f.v)]).reshape(-1, f.width) for f in frames()]
+            rows = [
+                np.concatenate([plane.reshape(-1) for plane in (f.y, f.u, f.v)]).reshape(-1, f.width) for f in islice(frames(), self.frames)
+            ]
             if not rows:
                 raise InputError(f"no frames: {key}")
             partial = path.with_suffix(f".{os.getpid()}.npy")

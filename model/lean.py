@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from model.interpolation import LearnedInterpolation, chroma_shift, exact, shuffle_channels_last
-from model.planes import INPUT_GAIN, RESIDUAL_GAIN, Network, Planes, State
+from model.planes import INPUT_GAIN, RESIDUAL_GAIN, LastLayer, Network, Planes, State
 from model.reparam import LinearTriple, fuse, load_fused
 
 ARCHITECTURE = "lean"
@@ -200,6 +200,16 @@ class Lean(Network):
         luma, chroma = self.sides[0] ** 2, self.sides[1] ** 2
         self.luma_base.load_kernel(bases[:luma, :-2])
         self.chroma_base.load_kernel(bases[luma : luma + chroma, -2:-1])
+
+    def last_layer(self) -> LastLayer:
+        if self.config.carried:
+            assert isinstance(self.head, nn.Conv2d) and self.head.bias is not None
+            module, weights, biases = self.head, [self.head.weight], [self.head.bias]
+        else:
+            heads = [cast(Head, head) for head in (self.head, self.chroma_head)]
+            module, weights = heads[0].features, [head.features.weight for head in heads]
+            biases = [cast(Tensor, head.cells.bias) for head in heads]
+        return LastLayer(module, self.config.features, tuple(weights), tuple(biases), tuple(self.sides), padding=0, gain=1)
 
     def apart(self) -> Lean:
         """The same network in the form that is trained, of which no layer carries the cells once it is deployed."""

@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from model.colour import PlanesToRgb, RgbToPlanes
 from model.interpolation import MIDDLES, Interpolation, LearnedInterpolation, chroma_shift, shuffle_channels_last
-from model.planes import INPUT_GAIN, RESIDUAL_GAIN, Network, Planes, State
+from model.planes import INPUT_GAIN, RESIDUAL_GAIN, LastLayer, Network, Planes, State
 from model.reparam import LinearTriple
 
 CELL_BOUND = 32.0  # tanh is 1 to float32's last bit from 9 on; 32 frames from zeros cannot reach it
@@ -197,6 +197,16 @@ class GameSR(Network):
             remembered = torch.stack(hidden, 1).flatten(0, 1)
             features = remembered + features if self.config.skip else remembered
         return self._picture(frames, source, features, lambda samples: samples).unflatten_time(batch), state
+
+    def last_layer(self) -> LastLayer | None:
+        if self.config.colour == "rgb":
+            return None
+        side = self.config.unshuffle * self.config.scale
+        assert self.head.bias is not None
+        sides = (side, side // 2, side // 2)
+        return LastLayer(
+            self.head, self.config.channels, (self.head.weight,), (self.head.bias,), sides, padding=1, gain=255 * RESIDUAL_GAIN
+        )
 
     def _base(self, block: int, shift: float) -> Interpolation:
         scale = self.config.scale

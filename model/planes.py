@@ -36,6 +36,22 @@ class State(NamedTuple):
     c: Tensor
 
 
+class LastLayer(NamedTuple):
+    """The 3x3 convolutions between a network's features and its picture, in the form that runs.
+
+    `module` takes the features in as its first channels. The first `features` inputs of `weights` are theirs, outputs over all tensors by
+    plane, in cells of `sides`; what they and `biases` give is `gain` code values.
+    """
+
+    module: nn.Module
+    features: int
+    weights: tuple[Tensor, ...]
+    biases: tuple[Tensor, ...]
+    sides: tuple[int, ...]
+    padding: int
+    gain: float
+
+
 class Network(nn.Module):
     """A network without memory, of which only `step` is missing; one with memory has its own `initial_state` and `forward` too.
 
@@ -69,6 +85,10 @@ class Network(nn.Module):
         """A clip, planes (N, T, 1, H, W) and (N, T, 1, H/2, W/2), all of its frames at once."""
         picture, _ = self.step(clip.flatten_time(), None)
         return picture.unflatten_time(clip.y.shape[0]), None
+
+    def last_layer(self) -> LastLayer | None:
+        """Of a network in the form that runs; None where what the features give is not the picture yet."""
+        return None
 
     def deployed(self) -> Self:
         """The network in the form that runs, in place."""
