@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import stat
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -92,7 +93,10 @@ def _check_provider(provider: str) -> None:
 
 def read_artifact(model: Path) -> bytes:
     """The bytes of a file that could be an artifact; raises ModelError."""
+    model = Path(model)
     try:
+        if not stat.S_ISREG(model.stat().st_mode):  # a pipe or a device has no size to be held against a limit
+            raise ModelError(f"model {model} is not a file")
         if model.stat().st_size > MAX_FILE_BYTES:
             raise ModelError(f"{model} is larger than {MAX_FILE_BYTES // 2**20} MiB: it is not a GameSR model")
         return model.read_bytes()

@@ -127,7 +127,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--frames", metavar="N", type=whole_number(), default=30, help="frames that count in a run (default: %(default)s)")
     parser.add_argument("--rounds", metavar="N", type=whole_number(), default=5, help="runs of every model (default: %(default)s)")
     parser.add_argument("--provider", choices=PROVIDERS, default="cpu", help="what runs the models (default: %(default)s)")
-    parser.add_argument("--threads", metavar="N", type=whole_number(), help="threads of the model (default: the physical cores)")
+    parser.add_argument("--threads", metavar="N", type=whole_number(most=1024), help="threads of the model (default: the physical cores)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
     return parser
 

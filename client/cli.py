@@ -42,8 +42,8 @@ examples:
 
 Figures of speed leave out warm-up, measuring and comparing; the bicubic and Lanczos of --reference and --compare are always
 computed on the cpu provider, whatever computes ours. The output is encoded with x264 at crf 12, so that it shows the
-network's work. Exit status: 0 done, 1 refused or failed (one sentence says why, nothing is left behind), 2 wrong usage,
-130 interrupted.
+network's work. Exit status: 0 done, 1 refused or failed (one sentence says why, and no half of a file is left behind), 2 wrong
+usage, 130 interrupted.
 """
 
 
@@ -78,7 +78,7 @@ def parser() -> argparse.ArgumentParser:
         type=_share,
         help="run the network only where most detail is, on about this share of the picture, such as 0.25; bicubic elsewhere",
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of the summary")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of the summary (to stderr with -o -)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
     return parser
 

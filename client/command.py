@@ -9,6 +9,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from types import FrameType
 
 from client.errors import GamesrError
@@ -30,10 +31,13 @@ def run_command(program: str, work: Callable[[], int | None], *, debug: bool, in
     1 for a GamesrError, a file that cannot be read or written, or when whoever reads the output has gone; 130 for Ctrl-C and SIGTERM,
     which raise KeyboardInterrupt once: a second one must not stop what the first one made the work clear up.
     """
+    _open_streams()
     for signum in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signum, _interrupt)
     try:
-        return work() or 0
+        status = work() or 0
+        sys.stdout.flush()  # what is lost at the interpreter's end is a traceback of its own
+        return status
     except KeyboardInterrupt:
         return fail(program, interrupted, 130)
     except GamesrError as error:
@@ -42,9 +46,12 @@ def run_command(program: str, work: Callable[[], int | None], *, debug: bool, in
         return fail(program, str(error))
     except BrokenPipeError:
         return reader_gone()
+    except MemoryError:
+        return fail(program, "there is not enough memory for this: ask for fewer or smaller pictures")
     except OSError as error:
         if debug:
             traceback.print_exc()
+        _drop_output()  # it may be what could not be written
         return fail(program, f"{error.filename}: {error.strerror}" if error.filename else str(error))
 
 
@@ -55,9 +62,24 @@ def fail(program: str, sentence: str, status: int = 1) -> int:
 
 
 def reader_gone() -> int:
-    """Whoever read the output has gone; the interpreter would complain again when it flushes at its end."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    """Whoever read the output has gone."""
+    _drop_output()
     return 1
+
+
+def _drop_output() -> None:
+    """What is still to be written to stdout goes nowhere: the interpreter would complain when it flushes at its end."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _open_streams() -> None:
+    """Those that whoever started the program closed are None; what is meant for them goes nowhere, and not into the next file opened."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open(mode))  # noqa: SIM115 - for as long as the program runs
 
 
 def whole_number(least: int = 1, most: int = 1_000_000_000) -> Callable[[str], int]:

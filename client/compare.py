@@ -85,6 +85,8 @@ class _OnePicture:
     def __init__(self, path: Path, labels: tuple[str, str], force: bool) -> None:
         if not path.parent.is_dir():
             raise OutputError(f"cannot write {path}: the folder {path.parent} does not exist")
+        if not os.access(path.parent, os.W_OK):  # it is written when all is done: too late to be told
+            raise OutputError(f"cannot write {path}: the folder {path.parent} may not be written to")
         if os.path.lexists(path) and not force:
             raise OutputError(f"{path} exists: name another file with --compare, or replace it with --force")
         self._path, self._labels = path, labels

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from client.artifact import ModelSpec, load_session, read_artifact, session_options
 from client.command import command_parser, run_command, whole_number
 from client.cores import physical_cores
+from client.frames import plane_shapes
 from client.models import DEFAULT_MODEL, find_model
 from client.runtime import OPENVINO, OpenVinoRuntime
-from client.upscaler import plane_shapes
 
 PROGRAM = "gamesr-profile"
 PROFILED = ("cpu", *OPENVINO)
@@ -121,7 +121,7 @@ def parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--scale", type=int, choices=(2, 3), default=2, help="of a shipped model (default: %(default)s)")
     parser.add_argument("--provider", choices=PROFILED, default="cpu", help="what runs the model (default: %(default)s)")
-    parser.add_argument("--threads", metavar="N", type=whole_number(), help="threads of the model (default: the physical cores)")
+    parser.add_argument("--threads", metavar="N", type=whole_number(most=1024), help="threads of the model (default: the physical cores)")
     parser.add_argument("--frames", metavar="N", type=whole_number(), default=30, help="frames that count (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="a JSON line an operation instead of the table")
     return parser

@@ -54,7 +54,8 @@ class Quality:
 
 
 def squared_error(reference: Plane, distorted: Plane) -> int:
-    """The sum of squared differences of two uint8 planes of one shape, exact."""
+    """The sum of squared differences of two uint8 planes, exact; raises ValueError where they are not, or not of one shape."""
+    _check_alike(reference, distorted)
     return _energy(_difference(reference, distorted))
 
 
@@ -69,10 +70,12 @@ def ssim(reference: Plane, distorted: Plane) -> float:
     """Structural similarity of two uint8 (H, W) planes in -1..1, averaged over the pixels whose whole window lies inside.
 
     Gaussian window 11x11 with sigma 1.5 and weights of sum 1, K1 = 0.01, K2 = 0.03, L = 255, population (co)variance, no
-    downsampling; the map is (H - 10, W - 10). Raises ValueError where either side is below 11. Z. Wang, A. C. Bovik,
+    downsampling; the map is (H - 10, W - 10). Raises ValueError where either side is below 11, and where the planes are not uint8 or
+    not of one shape. Z. Wang, A. C. Bovik,
     H. R. Sheikh, E. P. Simoncelli, "Image quality assessment: from error visibility to structural similarity",
     IEEE Trans. Image Processing 13(4), 2004.
     """
+    _check_alike(reference, distorted)
     height, width = reference.shape
     if min(height, width) < SSIM_WINDOW:
         raise ValueError(f"SSIM needs {SSIM_WINDOW}x{SSIM_WINDOW} pixels, not {width}x{height}")
@@ -83,6 +86,12 @@ def ssim(reference: Plane, distorted: Plane) -> float:
             total += _ssim_total(moments)
     windows: int = (height - SSIM_WINDOW + 1) * (width - SSIM_WINDOW + 1)
     return total / windows
+
+
+def _check_alike(reference: Plane, distorted: Plane) -> None:
+    if reference.shape != distorted.shape or not reference.dtype == distorted.dtype == np.uint8:
+        told = ", ".join(f"{plane.dtype} {plane.shape}" for plane in (reference, distorted))
+        raise ValueError(f"only uint8 planes of one shape are compared, not {told}")
 
 
 def _sums_and_squares(x: Plane, y: Plane) -> Image:

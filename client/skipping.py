@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from client.artifact import ModelSpec
-from client.frames import Frame
+from client.frames import Frame, plane_shapes
 from client.pipeline import Upscaler
 from client.repeats import RepeatUpscaler
 from client.tiles import Mask, TileGrid, Window
-from client.upscaler import OnnxUpscaler, State, copy_padded, plane_shapes
+from client.upscaler import OnnxUpscaler, State, copy_padded
 from client.windows import can_run_windows, run_windows, windowed_reach
 
 # Frames for which a recurrent network goes on with a tile that has stopped changing; docs/skipping.md says how it was measured.

@@ -12,10 +12,10 @@ import numpy as np
 
 from client.artifact import ModelSpec
 from client.errors import GamesrError, ModelError
-from client.frames import Frame
+from client.frames import Frame, plane_shapes
 from client.models import find_model
 from client.repeats import Shown
-from client.upscaler import OnnxUpscaler, State, plane_shapes
+from client.upscaler import OnnxUpscaler, State
 
 TIMED_FRAMES = 5
 MOST_REPEATS = 15  # by other tiers than the best: from what they compute a governor learns in a pause too that a better one fits
@@ -44,6 +44,8 @@ class TieredUpscaler:
     """
 
     def __init__(self, names: Sequence[str], *, display_height: int | None, provider: str, threads: int | None) -> None:
+        if not names:
+            raise ValueError("there is no tier without a model")
         self.names, self.provider = list(names), provider
         self.tier = 0
         self.costs_ns: list[int] = []
@@ -130,9 +132,15 @@ class TieredUpscaler:
         return TieredState(height, width, self._stream)
 
     def step(self, frame: Frame, state: TieredState) -> tuple[Frame, TieredState]:
-        """Upscale one frame with the chosen tier; the planes are not to be written to. Raises ValueError for a state of another stream."""
+        """Upscale one frame with the chosen tier.
+
+        The frame is kept for the next step: neither it nor the picture is to be written to. Raises ValueError for a state of another
+        stream and for a tier that is not there, or not ready yet (`complete`).
+        """
         if state.stream != self._stream:
             raise ValueError("this state is of a stream that was begun anew since")
+        if self.tier not in self._states:
+            raise ValueError(f"tier {self.tier} of {', '.join(self.names)} is not there, or not ready yet")
         if self.tier != self._running:
             self._begin_again()
         if self._shown and (not self._running or self._repeats < MOST_REPEATS) and (again := self._shown.again(frame)):

@@ -11,10 +11,11 @@ import numpy as np
 from client.artifact import ModelSpec
 from client.cores import physical_cores
 from client.errors import InputError, ModelError, ProviderError
-from client.frames import Frame, Plane
+from client.frames import Frame, Plane, plane_shapes
 from client.runtime import Binding, Runtime, load_runtime
 
 MAX_OUTPUT_PIXELS = 64 * 2**20
+MAX_THREADS = 1024
 
 
 class State:
@@ -70,10 +71,13 @@ class OnnxUpscaler:
 
     `provider` is one of client.runtime.PROVIDERS; `threads` is the number of threads of one operator, by default the physical cores
     available to the process. One upscaler serves any number of streams, one step at a time. Raises ModelError for a file
-    that is not an artifact of ours and ProviderError for a provider that is not installed or does not start.
+    that is not an artifact of ours, ProviderError for a provider that is not installed or does not start, and ValueError for threads
+    that are no number from 1 to 1024.
     """
 
     def __init__(self, model: Path, *, provider: str = "cpu", threads: int | None = None) -> None:
+        if threads is not None and not (isinstance(threads, int) and 1 <= threads <= MAX_THREADS):
+            raise ValueError(f"threads is {threads}, not a whole number from 1 to {MAX_THREADS}")
         self.provider = provider
         self.threads = threads or physical_cores()
         self._runtime, self.spec = load_runtime(model, provider, self.threads)
@@ -81,6 +85,8 @@ class OnnxUpscaler:
     def initial_state(self, height: int, width: int) -> State:
         """An empty memory for frames of `height` x `width` pixels; raises InputError when the result would be too large."""
         scale = self.spec.scale
+        if min(height, width) < 1:
+            raise ValueError(f"a frame of {width}x{height} has no pixels")
         if height * width * scale * scale > MAX_OUTPUT_PIXELS:
             raise InputError(
                 f"{width}x{height} upscaled by {scale} is more than {MAX_OUTPUT_PIXELS // 2**20} megapixels: use a smaller video or scale"
@@ -88,13 +94,20 @@ class OnnxUpscaler:
         return State(_StreamBuffers(self._runtime, self.spec, height, width), 0, restarted=False)
 
     def begin_again(self, state: State) -> State:
-        """An empty memory in the buffers of `state`, which is consumed: a stream that begins anew while it is played needs no new ones."""
-        buffers, current = state._take()
+        """An empty memory in the buffers of `state`, which is consumed: a stream that begins anew while it is played needs no new ones.
+
+        Raises ValueError for a consumed state or another upscaler's.
+        """
+        buffers, current = self._taken(state)
         buffers.clear(current)
         return State(buffers, current, restarted=False)
 
     def state_of(self, height: int, width: int, tensors: Sequence[np.ndarray]) -> State:
-        """The memory that `State.tensors` gave out, or one like it, for frames of `height` x `width` pixels."""
+        """The memory that `State.tensors` gave out, or one like it, for frames of `height` x `width` pixels.
+
+        The values are taken over in the dtype that the model has them in. Raises ValueError where there are more or fewer tensors, or of
+        other shapes.
+        """
         state = self.initial_state(height, width)
         state._buffers.fill(state._current, tensors)
         return state
@@ -107,11 +120,11 @@ class OnnxUpscaler:
         its planes are new arrays. `state` is consumed. A state that came out not finite is lost: the frame is computed
         again from zeros and the state returned says `restarted`.
 
-        Raises ValueError for a consumed state or one of another size, ModelError when the model fails on the frame.
+        Raises ValueError for a consumed state, one of another size or of another upscaler, ModelError when the model fails on the frame.
         """
         if (frame.height, frame.width) != (state.height, state.width):
             raise ValueError(f"a {frame.width}x{frame.height} frame for a state of {state.width}x{state.height}")
-        buffers, current = state._take()
+        buffers, current = self._taken(state)
         buffers.load(frame)
         planes, state_sum = buffers.run(current)
         restarted = not np.isfinite(state_sum)
@@ -122,6 +135,12 @@ class OnnxUpscaler:
                 raise ModelError(f"model {self.spec.name} loses its state even when it starts from zeros: the file is damaged")
         picture = replace(frame, y=planes[0], u=planes[1], v=planes[2])
         return picture, State(buffers, 1 - current, restarted)
+
+    def _taken(self, state: State) -> tuple[_StreamBuffers, int]:
+        """What `state` holds, which is consumed; its buffers are bound to the model that made it."""
+        if state._buffers.runtime is not self._runtime:
+            raise ValueError(f"this state was made by another upscaler than this one of {self.spec.name}")
+        return state._take()
 
     def warm_up(self, height: int, width: int) -> None:
         """Run a few grey frames, so that the first real one does not pay for allocation and first use."""
@@ -136,7 +155,7 @@ class _StreamBuffers:
 
     def __init__(self, runtime: Runtime, spec: ModelSpec, height: int, width: int) -> None:
         self.height, self.width = height, width
-        self._runtime, self._spec = runtime, spec
+        self.runtime, self._spec = runtime, spec
         self._padded = spec.padded(height), spec.padded(width)
         self._inputs = [np.empty((1, 1, *shape), np.uint8) for shape in plane_shapes(*self._padded)]
         self._input_tensors = [runtime.tensor(array) for array in self._inputs]
@@ -158,7 +177,7 @@ class _StreamBuffers:
         for name, tensor in zip(("y", "u", "v"), self._input_tensors, strict=True):
             binding.bind_input(name, tensor)  # for every frame: where the device has its own memory, binding is what copies
         for name, array in zip(("y_up", "u_up", "v_up"), outputs, strict=True):
-            binding.bind_output(name, self._runtime.tensor(array))
+            binding.bind_output(name, self.runtime.tensor(array))
         try:
             binding.run()
         except Exception as error:  # the runtime's exceptions have no common base
@@ -171,22 +190,26 @@ class _StreamBuffers:
         self.fill(current, self._zeros())
 
     def fill(self, current: int, arrays: Sequence[np.ndarray]) -> None:
-        for tensor, array in zip(self._states[current], arrays, strict=True):
-            tensor.update_inplace(array)
+        """Take over values; a runtime would take over the bytes of another dtype, or what lies behind fewer of them."""
+        shapes = [own.shape for own in self._arrays[current]]
+        if [np.shape(array) for array in arrays] != shapes:
+            raise ValueError(f"tensors of {[np.shape(array) for array in arrays]} are no state of {self._spec.name}, which has {shapes}")
+        for tensor, array, own in zip(self._states[current], arrays, self._arrays[current], strict=True):
+            tensor.update_inplace(np.ascontiguousarray(array, own.dtype))
 
     def tensors(self, current: int) -> list[np.ndarray]:
-        if self._arrays[current] and self._runtime.has_own_memory:
+        if self._arrays[current] and self.runtime.has_own_memory:
             raise ProviderError(f"the state of {self._spec.name} lies in the memory of a device, where no part of it can be replaced")
         return self._arrays[current]
 
     def arrays(self, current: int) -> list[np.ndarray]:
-        if self._runtime.has_own_memory:
+        if self.runtime.has_own_memory:
             return [tensor.numpy() for tensor in self._states[current]]  # a copy of what lies there
         return self._arrays[current]  # on the CPU a tensor made from an array is that array, and does not keep it alive
 
     def copy(self, current: int) -> _StreamBuffers:
         """Buffers of their own, whose state set 0 is this one's set `current`."""
-        twin = _StreamBuffers(self._runtime, self._spec, self.height, self.width)
+        twin = _StreamBuffers(self.runtime, self._spec, self.height, self.width)
         twin.fill(0, self.arrays(current))
         return twin
 
@@ -197,12 +220,12 @@ class _StreamBuffers:
     def _bind(self, current: int) -> Binding:
         inputs = {name: array.shape for name, array in zip(("y", "u", "v"), self._inputs, strict=True)}
         states = {state.input: array.shape for state, array in zip(self._spec.state, self._arrays[current], strict=True)}
-        binding = self._runtime.binding({**inputs, **states})
+        binding = self.runtime.binding({**inputs, **states})
         for spec, before, after in zip(self._spec.state, self._states[current], self._states[1 - current], strict=True):
             binding.bind_input(spec.input, before)
             binding.bind_output(spec.output, after)
         if self._spec.state:
-            binding.bind_output("state_sum", self._runtime.tensor(self._state_sum))
+            binding.bind_output("state_sum", self.runtime.tensor(self._state_sum))
         return binding
 
 
@@ -212,9 +235,3 @@ def copy_padded(plane: Plane, target: Plane) -> None:
     target[:height, :width] = plane
     target[:height, width:] = target[:height, width - 1 : width]
     target[height:] = target[height - 1]
-
-
-def plane_shapes(height: int, width: int) -> tuple[tuple[int, int], tuple[int, int], tuple[int, int]]:
-    """Rows and columns of y, u and v in 4:2:0."""
-    chroma = (-(-height // 2), -(-width // 2))
-    return (height, width), chroma, chroma

@@ -48,6 +48,8 @@ class OpenVideo:
     there to the next key frame the frames are marked damaged. `announced_frames` is what the container says it holds, and
     `estimated_frames` that or its duration times its frame rate; None where it says neither.
 
+    Once it is closed, asking for more raises ValueError; frames that came out before stay valid.
+
     Raises InputError, in one sentence that begins with `name`, for what holds no video and for pictures that are not supported:
     interlaced, larger than 8192x8192, or of another pixel format.
     """
@@ -78,11 +80,13 @@ class OpenVideo:
         self.estimated_frames = self.announced_frames or (round(duration_us * self.frame_rate / 1_000_000) if duration_us else None)
         self._damaged = False
         self._begun = False
+        self._closed = False
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._closed = True
         self._container.close()
 
     def __iter__(self) -> Iterator[Decoded]:
@@ -91,6 +95,7 @@ class OpenVideo:
 
     def decode(self, packet: av.Packet[VideoStream]) -> Iterator[Decoded]:
         """The frames that one of `packets` completes."""
+        self._check_open()
         packet_ns = time.perf_counter_ns()
         try:
             pictures = packet.decode()
@@ -99,6 +104,7 @@ class OpenVideo:
             self._damaged = True
             return
         for picture in pictures:
+            self._check_open()
             frame = self._frame(picture)
             yield Decoded(frame, packet_ns, time.perf_counter_ns())
             packet_ns = time.perf_counter_ns()  # a second frame of the same packet did not wait while the first was used
@@ -111,6 +117,7 @@ class OpenVideo:
         """Packets with something in them, then one empty one: it flushes the decoder, and any other would end it early."""
         packets = self._container.demux(self._stream)
         while True:
+            self._check_open()
             try:
                 packet = next(packets, None)
             except av.FFmpegError:
@@ -124,6 +131,10 @@ class OpenVideo:
         flush = cast("av.Packet[VideoStream]", av.Packet())
         flush.stream, flush.time_base = self._stream, self.time_base
         yield flush
+
+    def _check_open(self) -> None:
+        if self._closed:  # FFmpeg would read what is freed
+            raise ValueError(f"{self.name} was closed: take its frames before that, in the thread that closes it")
 
     def _frame(self, picture: av.VideoFrame) -> Frame:
         if picture.interlaced_frame:
@@ -166,6 +177,7 @@ class VideoSource(OpenVideo):
 
 def open_local(path: Path) -> InputContainer:
     """Open a file, and nothing but that file whatever is written in it; raises InputError."""
+    path = Path(path)
     try:
         status = path.stat()
     except FileNotFoundError as error:
@@ -187,7 +199,7 @@ def open_local(path: Path) -> InputContainer:
 
 
 def plane_view(plane: VideoPlane) -> Plane:
-    """The decoder's own memory as uint8 (height, width); rows are `line_size` bytes apart, nothing is copied."""
+    """The picture's own memory as uint8 (height, width); rows are `line_size` bytes apart, nothing is copied."""
     if plane.line_size <= 0:
         raise InputError("pictures that are stored bottom-up are not supported")
     rows = np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)
@@ -197,7 +209,8 @@ def plane_view(plane: VideoPlane) -> Plane:
 def from_av_frame(picture: av.VideoFrame, *, damaged: bool = False) -> Frame:
     """An 8-bit PyAV frame as a `Frame`: 4:2:0 over the same memory, 4:2:2 and 4:4:4 with chroma filtered to left-sited 4:2:0.
 
-    `damaged` is set too when the decoder marked the picture corrupt. Raises InputError for another pixel format.
+    The planes are not to be written to. `damaged` is set too when the decoder marked the picture corrupt. Raises InputError for another
+    pixel format.
     """
     name = picture.format.name
     _check_format(name)
@@ -212,6 +225,8 @@ def from_av_frame(picture: av.VideoFrame, *, damaged: bool = False) -> Frame:
             u, v = halve_rows(u), halve_rows(v)
         elif name.endswith("444p"):
             u, v = halve_rows_and_columns(u), halve_rows_and_columns(v)
+    for plane in (y, u, v):
+        plane.setflags(write=False)  # a decoder predicts the pictures to come from this memory
     colour_range = 2 if name.startswith("yuvj") else int(picture.color_range)
     tags = ColourTags(colour_range, int(picture.color_primaries), int(picture.color_trc), int(picture.colorspace))
     return Frame(y, u, v, picture.pts, picture.time_base, tags, damaged or bool(picture.is_corrupt))

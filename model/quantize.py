@@ -21,8 +21,8 @@ from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_
 
 from client.artifact import ModelSpec, load_session
 from client.errors import InputError, ModelError
-from client.frames import Frame
-from client.upscaler import copy_padded, plane_shapes
+from client.frames import Frame, plane_shapes
+from client.upscaler import copy_padded
 from client.video import read_frames
 from model.artifact_files import Page, write_artifact
 from model.artifact_weights import network_of_artifact

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -100,8 +101,12 @@ def test_files_that_cannot_be_models_are_refused(tmp_path: Path) -> None:
         file.truncate(MAX_FILE_BYTES + 1)
     with pytest.raises(ModelError, match="larger than 64 MiB"):
         OnnxUpscaler(tmp_path / "huge.onnx")
-    with pytest.raises(ModelError, match="cannot be read"):
-        OnnxUpscaler(tmp_path)
+    with pytest.raises(ModelError, match="cannot be read: No such file"):
+        OnnxUpscaler(tmp_path / "missing.onnx")
+    os.mkfifo(tmp_path / "pipe.onnx")
+    for path in (tmp_path, tmp_path / "pipe.onnx", Path("/dev/zero")):
+        with pytest.raises(ModelError, match="is not a file"):
+            OnnxUpscaler(path)
 
 
 def test_a_model_cannot_make_the_runtime_read_other_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,13 +9,13 @@ from av.codec.context import ThreadType
 
 import client.live
 from client.cloud import CloudEncoder, NetworkSettings
-from client.frames import Frame
+from client.frames import Frame, plane_shapes
 from client.live import LiveDecoder, Received
 from client.quality import squared_error
 from client.reception import Reception
 from client.rtp import CLOCK_HZ
 from client.sender import RtpStream, Unit
-from client.upscaler import MAX_OUTPUT_PIXELS, plane_shapes
+from client.upscaler import MAX_OUTPUT_PIXELS
 from client.video import from_av_frame
 from server.link import Weather
 from server.simulation import SENDER
