@@ -182,10 +182,11 @@ def _source_notes(source: OpenVideo, frames: int, *, measured: bool) -> list[str
     estimated = source.estimated_frames
     if source.announced_frames is None and estimated is not None and frames < 0.9 * estimated:  # a rate that varies is no cut
         notes.append(f"the file's duration means about {estimated} frames, {frames} could be decoded: it may be cut short")
-    if source.announced_frames is not None and source.announced_frames != frames:
+    fewer = source.announced_frames is not None and source.announced_frames != frames
+    if fewer:
         notes.append(f"the file announces {source.announced_frames} frames, {frames} could be decoded")
-        if measured:
-            notes.append("frames are measured by their number, so after a missing one they meet the wrong frame of the reference")
+    if measured and (fewer or source.decode_errors):
+        notes.append("frames are measured by their number, so after a missing one they meet the wrong frame of the reference")
     return notes
 
 

@@ -74,7 +74,7 @@ def sums_of(network: Network, layer: LastLayer, pair: Pair) -> Sums:
     try:
         with torch.no_grad():
             state = network.initial_state(1, pair.low.height, pair.low.width)
-            for index in range(frames):
+            for index in range(frames) if state is not None else looked_at:
                 cells: list[Tensor] = []
                 features.clear()
                 _, state = network.step(_planes(pair.low, index), state, _kept_in(cells))

@@ -56,17 +56,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         refit = Refit(model)
         scale = refit.spec.scale
         (path,) = new_artifacts(arguments.name, [scale], arguments.folder, source=model, force=arguments.force)
-        degradations = list(dict.fromkeys(Degradation.parse(text) for text in arguments.degradations))
+        degradations = [Degradation.parse(text) for text in arguments.degradations]
         cache = FootageCache(arguments.cache, FRAMES)
         splits = {split: load_scenes(arguments.footage, split=split) for split in ("train", "validate")}
         with tqdm(total=sum(map(len, splits.values())), unit="scene", disable=not sys.stderr.isatty()) as bar:
             for split, sums in (("train", refit.train), ("validate", refit.held_out)):
                 for scene in splits[split]:
-                    for pair in (pair for takes in load_pairs([scene], cache, scale, degradations) for pair in takes):
+                    for pair in (pair for takes in load_pairs([scene], cache, scale, dict.fromkeys(degradations)) for pair in takes):
                         sums[pair.title] = sums_of(refit.network, refit.layer, pair)
                     bar.update()
-        gains = refit.solve(arguments.degradations)
-        facts = {"degradations": arguments.degradations, "frames": FRAMES, "scenes": [scene.title for scene in splits["train"]]}
+        gains = refit.solve([str(how) for how in degradations])
+        facts = {"degradations": [str(how) for how in degradations], "frames": FRAMES, "scenes": [scene.title for scene in splits["train"]]}
         refit.write(path, name=arguments.name, facts=facts, page=card_page)
         print("| held out | input | PSNR-Y | PSNR-U | PSNR-V |\n|---|---|---|---|---|")
         for (game, how), rows in _by_game(gains).items():

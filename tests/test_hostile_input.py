@@ -169,6 +169,20 @@ def test_a_packet_of_garbage(saved: Run, make_clip: MakeClip, tmp_path: Path) ->
     assert (record["damaged_frames"], record["state_resets"]) == (2, 1)  # where damage ends
 
 
+def test_what_is_measured_behind_a_frame_that_is_missing_is_said_to_be_shifted(
+    make_clip: MakeClip, model_file: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In a container that announces no number of frames, too."""
+    clip, original = make_clip("clip.mkv"), make_clip("original.mkv", width=128, height=96)
+    packet = packets_of(clip)[3]
+    broken = write(tmp_path / "garbage.mkv", clip.read_bytes().replace(packet, NOISE[: len(packet)]))
+    for path, shifted in ((clip, 0), (broken, 1)):
+        options = ["-o", str(tmp_path / "saved.mp4"), "--reference", str(original), "--model", str(model_file()), "--json", "--force"]
+        assert cli.main([str(path), *options]) == 0
+        notes = json.loads(capsys.readouterr().out)["notes"]
+        assert sum("they meet the wrong frame of the reference" in note for note in notes) == shifted
+
+
 def test_missing_packets(saved: Run, make_clip: MakeClip, tmp_path: Path) -> None:
     packets = packets_of(make_clip("clip.h264"))
     record = saved(write(tmp_path / "holes.h264", b"".join(packets[:2] + packets[4:])))
