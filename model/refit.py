@@ -33,7 +33,7 @@ from model.train import source_commit
 
 FRAMES = 24  # of each clip, over which a state is carried
 EVERY = 6  # of which one in so many is looked at
-SHARE = 1 / 9  # of its cells, as many as there are pixels in a window of the layer
+SHARE = 1 / 27  # of its cells: neighbours say nearly the same
 ROUNDS = 12  # more change nothing that a float32 holds
 RIDGE = 1e-7  # of the mean square of a feature: for features that are never anything but zero
 
@@ -99,10 +99,13 @@ def _kept_in(cells: list[Tensor]) -> Callable[[Tensor], Tensor]:
 
 def _sums(features: Tensor, errors: Tensor, padding: int, seed: int) -> list[Array]:
     """Of one frame; a one beside the features stands for the biases."""
-    windows = F.unfold(features, 3, padding=padding)[0]
-    cells = windows.shape[1]
+    padded = F.pad(features[0], (padding,) * 4)
+    columns, cells = errors.shape[3], errors.shape[2] * errors.shape[3]
     chosen = torch.randperm(cells, generator=torch.Generator().manual_seed(seed))[: max(1, round(SHARE * cells))]
-    x = torch.cat((windows[:, chosen].T, torch.ones(len(chosen), 1)), 1).double()
+    corners = chosen // columns * padded.shape[2] + chosen % columns  # of each one's window of 3x3
+    offsets = (torch.arange(3)[:, None] * padded.shape[2] + torch.arange(3)).flatten()
+    windows = padded.flatten(1)[:, (corners[:, None] + offsets).flatten()].reshape(len(padded), len(chosen), 9)
+    x = torch.cat((windows.permute(1, 0, 2).flatten(1), torch.ones(len(chosen), 1)), 1).double()
     e = errors[0].flatten(1).T[chosen].double()
     return [(part / len(chosen)).numpy() for part in (x.T @ x, x.T @ e, (e**2).sum(0))]
 
