@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
-import numpy as np
-
 
 @dataclass(frozen=True, slots=True)
 class Stamps:
@@ -19,6 +17,12 @@ class Stamps:
     decoded_ns: int
     upscaled_ns: int
     written_ns: int
+
+
+def percentile(ascending: Sequence[float], percent: int) -> float:
+    """The least of the values that so many percent of them do not exceed: one of them, never one between two (nearest rank)."""
+    rank = -(-percent * len(ascending) // 100)  # whole numbers: 0.07 * 100 frames come to more than 7
+    return ascending[max(rank, 1) - 1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,9 +40,8 @@ class LatencySummary:
         """Summarise durations in nanoseconds; raises ValueError when there are none."""
         if not len(durations_ns):
             raise ValueError("no durations to summarise")
-        us = np.asarray(durations_ns, np.float64) / 1000
-        p50, p95, p99 = np.percentile(us, (50, 95, 99), method="inverted_cdf")
-        return cls(len(us), float(p50), float(p95), float(p99), float(us.max()))
+        us = sorted(float(duration_ns) / 1000 for duration_ns in durations_ns)
+        return cls(len(us), percentile(us, 50), percentile(us, 95), percentile(us, 99), us[-1])
 
     def record(self) -> dict[str, float]:
         return asdict(self)

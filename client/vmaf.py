@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from client.errors import GamesrError
 from client.frames import Frame
+from client.timing import percentile
 
 MODELS = {"vmaf": "vmaf_v0.6.1", "vmaf_neg": "vmaf_v0.6.1neg"}
 THREADS = 2
@@ -25,7 +26,7 @@ SMALLEST_SIDE = 32  # libvmaf looks at four scales; below this it crashes instea
 
 @dataclass(frozen=True)
 class VmafScores:
-    """Per-frame scores of one model pooled over the clip, in 0..100: mean, harmonic mean of (score + 1), 5th percentile."""
+    """Per-frame scores of one model pooled over the clip, in 0..100: mean, harmonic mean of (score + 1), 5th percentile (nearest rank)."""
 
     mean: float
     harmonic_mean: float
@@ -34,7 +35,7 @@ class VmafScores:
     @classmethod
     def pool(cls, scores: NDArray[np.float64]) -> Self:
         harmonic = 1.0 / float(np.mean(1.0 / (scores + 1.0))) - 1.0  # libvmaf's own definition: a zero must not swallow the clip
-        return cls(float(scores.mean()), harmonic, float(np.percentile(scores, 5)))
+        return cls(float(scores.mean()), harmonic, percentile(sorted(scores.tolist()), 5))
 
 
 def why_unavailable(width: int, height: int) -> str | None:

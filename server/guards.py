@@ -7,6 +7,8 @@ import contextlib
 import hashlib
 import hmac
 import ipaddress
+import math
+import time
 from typing import Annotated
 from urllib.parse import urlsplit
 
@@ -62,7 +64,8 @@ class Guards:
 
     A browser that was led here from another site must not act for its user: a changing request of another origin is
     refused, and, where only this machine is meant to ask, so is any name of the host but the machine's own (a site can
-    make its name point at this address). Bodies are bounded in bytes and in the time between two pieces.
+    make its name point at this address). Bodies are bounded in bytes, in the time between two pieces, and in that of all
+    of them, which for uploads is bounded where they are kept: their callers have shown the key by then.
     """
 
     def __init__(self, app: ASGIApp, *, limits: Limits, loopback: bool) -> None:
@@ -78,13 +81,15 @@ class Guards:
         if refusal is not None:
             await JSONResponse({"detail": refusal}, 403)(scope, receive, guarded)
             return
-        most = self._limits.upload_bytes if scope["path"] == UPLOAD_PATH else self._limits.body_bytes
+        upload = scope["path"] == UPLOAD_PATH
+        most = self._limits.upload_bytes if upload else self._limits.body_bytes
         length = headers.get("content-length", "0")
         if length.isdigit() and int(length) > most:
             await _drain(receive)
             await JSONResponse({"detail": _too_large(most)}, 413, {"Connection": "close"})(scope, receive, guarded)
             return
-        await self._app(scope, _bounded(receive, most, self._limits.idle_s), guarded)
+        whole_s = math.inf if upload else self._limits.body_s
+        await self._app(scope, _bounded(receive, most, self._limits.idle_s, whole_s), guarded)
 
     def _refusal(self, method: str, headers: Headers) -> str | None:
         host = headers.get("host", "")
@@ -96,17 +101,20 @@ class Guards:
         return None
 
 
-def _bounded(receive: Receive, most: int, idle_s: float) -> Receive:
-    received = 0
+def _bounded(receive: Receive, most: int, idle_s: float, whole_s: float) -> Receive:
+    received, end = 0, math.inf
 
     async def bounded() -> Message:
-        nonlocal received
+        nonlocal received, end
         if received < 0:  # the body is there: what comes next is that the caller leaves, whenever that is
             return await receive()
+        end = min(end, time.monotonic() + whole_s)  # from when it is first waited for
+        left_s = end - time.monotonic()
         try:
-            message = await asyncio.wait_for(receive(), idle_s)
+            message = await asyncio.wait_for(receive(), min(idle_s, left_s))
         except TimeoutError:
-            raise HTTPException(408, f"nothing came for {idle_s:g} s: send it again", {"Connection": "close"}) from None
+            late = f"nothing came for {idle_s:g} s" if idle_s < left_s else f"it was not here after {whole_s:g} s"
+            raise HTTPException(408, f"{late}: send it again", {"Connection": "close"}) from None
         if message["type"] == "http.request":
             received += len(message.get("body", b""))
             if received > most:

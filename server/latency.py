@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -24,8 +25,10 @@ FRAMES = 100  # that count: fewer have no 99th percentile
 
 
 def latency_key(ask: Ask) -> str:
-    """The sha256 of what a latency depends on, as far as that can be known: the point, the processor, the threads."""
-    content = [ask.point.key, machine_name(), physical_cores(), FRAMES]
+    """The sha256 of what a latency depends on, as far as that can be known: the point, the processor, the threads, and the niceness."""
+    niceness = os.nice(0)
+    # Without a nought: a store's latencies, which were taken at none, keep their keys.
+    content = [ask.point.key, machine_name(), physical_cores(), FRAMES, *([niceness] if niceness else [])]
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 

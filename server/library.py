@@ -47,9 +47,9 @@ class Library:
     def clips(self) -> tuple[list[StoredClip], dict[str, str]]:
         """Every clip, and the files of the folder that cannot be used with the reason why."""
         found, refused = [], {}
-        for name in sorted(self._files()):
+        for name, path in sorted(self._files().items()):
             try:
-                clip = self.clip(name)
+                clip = self._clip(name, path)
             except InputError as error:
                 refused[name] = str(error)
             else:
@@ -59,21 +59,7 @@ class Library:
     def clip(self, name: str) -> StoredClip | None:
         """None where there is no such clip; raises InputError for a file of the folder that cannot be used."""
         path = self.path(name)
-        if path is None:
-            return None
-        try:
-            status = path.stat()
-        except OSError:
-            return None
-        stamp = _stamp(status)
-        row = self._row(name, stamp)
-        if row is None:
-            with _LOOKED_AT:
-                row = self._row(name, stamp) or self._look_at(name, path, stamp)
-        title, known, refused = row
-        if known is None:
-            raise InputError(str(refused))
-        return _stored(name, title, status.st_size, Known(**json.loads(known)))
+        return None if path is None else self._clip(name, path)
 
     def path(self, name: str) -> Path | None:
         return self._files().get(name)
@@ -117,6 +103,21 @@ class Library:
             path.unlink(missing_ok=True)
             with self._database.transaction() as connection:
                 connection.execute("DELETE FROM clips WHERE name = ?", (name,))
+
+    def _clip(self, name: str, path: Path) -> StoredClip | None:
+        try:
+            status = path.stat()
+        except OSError:
+            return None
+        stamp = _stamp(status)
+        row = self._row(name, stamp)
+        if row is None:
+            with _LOOKED_AT:
+                row = self._row(name, stamp) or self._look_at(name, path, stamp)
+        title, known, refused = row
+        if known is None:
+            raise InputError(str(refused))
+        return _stored(name, title, status.st_size, Known(**json.loads(known)))
 
     def _look_at_all(self) -> None:
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import stat
 from pathlib import Path
 
 import numpy as np
@@ -72,7 +73,10 @@ def _network_input(frame: Frame) -> NDArray[np.float32]:
 
 def _read(path: Path) -> bytes:
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):  # of which nobody knows how much will come
+            raise ModelError(f"LPIPS model {path} is not a file")
+        if status.st_size > MAX_FILE_BYTES:
             raise ModelError(f"{path} is larger than {MAX_FILE_BYTES // 2**20} MiB: it is not LPIPS")
         return path.read_bytes()
     except OSError as error:

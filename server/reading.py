@@ -14,6 +14,7 @@ from urllib.parse import quote
 from client.errors import OutputError
 from server.asked import AskedSweep
 from server.points import LatencyResult, PointResult
+from server.records import read_record
 from server.store import APPLICATION_ID, SCHEMA_VERSION
 
 MOST_LATENCIES = 1000
@@ -31,7 +32,8 @@ class KeptSweep:
 class StoreReader:
     """Reads from any thread; a store that is not there yet is an empty one.
 
-    Raises OutputError, in one sentence, where the file cannot be read or is not a store of this version.
+    Raises OutputError, in one sentence, where the file cannot be read, is not a store of this version, or holds a record that no
+    sweep has written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -43,7 +45,7 @@ class StoreReader:
             if connection is None or not _has_sweeps(connection):
                 return {}
             rows = connection.execute("SELECT key, created_at, record FROM sweeps ORDER BY created_at DESC").fetchall()
-        return {key: KeptSweep(_asked(record), created_at) for key, created_at, record in rows}
+        return {key: KeptSweep(_asked(record, self.path), created_at) for key, created_at, record in rows}
 
     def sweep(self, beginning: str) -> tuple[str, KeptSweep] | None:
         """The key and the sweep whose key begins so."""
@@ -52,7 +54,7 @@ class StoreReader:
                 return None
             query = "SELECT key, created_at, record FROM sweeps WHERE substr(key, 1, ?) = ?"
             row = connection.execute(query, (len(beginning), beginning)).fetchone()
-        return None if row is None else (row[0], KeptSweep(_asked(row[2]), row[1]))
+        return None if row is None else (row[0], KeptSweep(_asked(row[2], self.path), row[1]))
 
     def points(self, asked: AskedSweep) -> list[PointResult]:
         """Those of its points that are there, in its order and under its names."""
@@ -60,23 +62,33 @@ class StoreReader:
         results = []
         for point in asked.points:
             if point.key in records:
-                result = PointResult.from_record(json.loads(records[point.key]))
+                result = read_record(PointResult, records[point.key], self.path)
                 results.append(replace(result, point=replace(result.point, clip=point.clip, upscaler=point.upscaler)))
         return results
 
     def latencies(self, asked: AskedSweep) -> list[LatencyResult]:
         """Those of its latencies that are there, in its order and under its names."""
         records = self._records("latencies", asked.latencies)
+        results = [read_record(LatencyResult, records[key], self.path) for key in asked.latencies if key in records]
+        # What is asked has the names and no contents; the points have both.
+        points = [result.point for result in self.points(asked)] if results else []
         clips = {clip.sha256: clip.name for clip in asked.clips}
-        results = [LatencyResult.from_record(json.loads(records[key])) for key in asked.latencies if key in records]
-        return [replace(result, clip=clips.get(result.clip_sha256, result.clip)) for result in results]
+        upscalers = {point.upscaler_sha256: point.upscaler for point in points}
+        return [
+            replace(
+                result,
+                clip=clips.get(result.clip_sha256, result.clip),
+                upscaler=upscalers.get(result.upscaler_sha256, result.upscaler),
+            )
+            for result in results
+        ]
 
     def all_latencies(self) -> list[LatencyResult]:
         """Of every sweep, the newest first, at most MOST_LATENCIES."""
         with self._open() as connection:
             query = f"SELECT record FROM latencies ORDER BY rowid DESC LIMIT {MOST_LATENCIES}"
             rows = [] if connection is None else connection.execute(query).fetchall()
-        return [LatencyResult.from_record(json.loads(record)) for (record,) in rows]
+        return [read_record(LatencyResult, record, self.path) for (record,) in rows]
 
     def counts(self, asked: AskedSweep) -> tuple[int, int]:
         """How many of its points and of its latencies are there. Neither ever falls: results are not taken back."""
@@ -124,8 +136,8 @@ class StoreReader:
 
 
 @lru_cache(maxsize=256)
-def _asked(record: str) -> AskedSweep:
-    return AskedSweep.from_record(json.loads(record))
+def _asked(record: str, store: Path) -> AskedSweep:
+    return read_record(AskedSweep, record, store)
 
 
 def _has_sweeps(connection: sqlite3.Connection) -> bool:

@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 import socket
-import sys
 import tempfile
 import traceback
 from collections.abc import Sequence
@@ -16,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 
-from client.command import command_parser
+from client.command import command_parser, fail, reader_gone
 from client.errors import GamesrError, InputError, OutputError, how_to_install
 from server.guards import is_loopback
 from server.runner import RunnerProcess, add_folders
@@ -67,8 +66,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except GamesrError as error:
         if arguments.debug:
             traceback.print_exc()
-        print(f"{PROGRAM}: {error}", file=sys.stderr)
-        return 1
+        return fail(PROGRAM, str(error))
+    except OSError as error:
+        if arguments.debug:
+            traceback.print_exc()
+        reader_gone()  # the address may be what could not be printed
+        return fail(PROGRAM, f"{error.filename}: {error.strerror}" if error.filename else str(error))
     return 0
 
 

@@ -13,6 +13,7 @@ class Limits:
     """What one caller, or all of them together, may take. Uploads are decoded whole, in a process that `decode_*` bound."""
 
     body_bytes: int = 64 * 1024  # of everything but an upload
+    body_s: float = 30.0
     connections_at_once: int = 256
     idle_s: float = 10.0  # between two pieces of a body, and for the head of a request
     upload_bytes: int = 512 * MIB

@@ -124,12 +124,15 @@ ROWS: tuple[tuple[Scene, str], ...] = (
 
 @dataclass(frozen=True)
 class Row:
-    """One scene under one rate control. `whole` is of computing all, the rest of skipping.
+    """One scene under one rate control. `whole` is of computing all, the rest of skipping. `sha256` is the model's.
 
     Times are processor time a frame, of all threads, for decoding and upscaling. A PSNR is None where nothing differs.
     """
 
     clip: str
+    model: str
+    sha256: str
+    provider: str
     scene: str
     rate_control: str
     frames: int
@@ -185,6 +188,9 @@ def measure(clip: str, frames: list[Frame], scene: Scene, rate_control: str, kbp
         whole_db, skipping_db = (psnr_db(error / samples) if error else None for error in errors)
         return Row(
             clip,
+            upscaler.spec.name,
+            upscaler.spec.sha256,
+            upscaler.provider,
             scene.__name__,
             rate_control,
             count,

@@ -16,6 +16,7 @@ from typing import Self
 from client.errors import OutputError
 from server.asked import AskedSweep
 from server.points import LatencyResult, PointResult
+from server.records import read_record
 from server.wal import write_ahead
 
 SCHEMA_VERSION = 1
@@ -39,7 +40,8 @@ class Store:
     sweep is at work on a key. It is a lease of `lease_s` seconds that a thread renews while the store is open: when a sweep
     was killed, what it had claimed is free again after that time. Leaving the context gives all claims back.
 
-    Raises OutputError, in one sentence, for a file that is not a store, is of another schema version, or cannot be written.
+    Raises OutputError, in one sentence, for a file that is not a store, is of another schema version, or cannot be written, and for
+    a record that no sweep has written.
     """
 
     def __init__(self, path: Path, *, lease_s: float = LEASE_S) -> None:
@@ -69,11 +71,11 @@ class Store:
 
     def point(self, key: str) -> PointResult | None:
         record = self._record("points", key)
-        return None if record is None else PointResult.from_record(json.loads(record))
+        return None if record is None else read_record(PointResult, record, self.path)
 
     def latency(self, key: str) -> LatencyResult | None:
         record = self._record("latencies", key)
-        return None if record is None else LatencyResult.from_record(json.loads(record))
+        return None if record is None else read_record(LatencyResult, record, self.path)
 
     def keep_point(self, result: PointResult) -> None:
         """Store a result and give its claim back, both or neither; a result that is there already stays."""

@@ -80,7 +80,7 @@ class _Points:
                     asks.append(ask)
                 else:
                     self.reused += 1
-                    yield PointReused(result)
+                    yield PointReused(replace(result, point=ask.point))  # its names are of whoever measured it
             if asks:
                 left.append(replace(job, asks=tuple(asks)))
         self._left = left
@@ -132,7 +132,7 @@ def _latencies(job: Job, store: Store) -> Iterator[Event]:
             point, key = ask.point, latency_key(ask)
             found = store.latency(key)
             if found is not None:
-                yield LatencyReused(found)
+                yield LatencyReused(replace(found, clip=point.clip, upscaler=point.upscaler))
                 continue
             try:
                 stream = stream or stack.enter_context(encoded_beginning(job))

@@ -8,6 +8,7 @@ from enum import Enum
 from itertools import groupby
 
 from client.quality import psnr_db
+from client.timing import percentile
 
 
 class View(Enum):
@@ -51,9 +52,8 @@ class Viewing:
         return _psnr(sum(errors) / len(errors))
 
     def psnr_y_p5_db(self, upscaler: str) -> float | None:
-        """What all but the worst twentieth of the pictures reach (nearest rank)."""
-        worst_first = sorted(self.errors[upscaler], reverse=True)
-        return _psnr(worst_first[len(worst_first) // 20])
+        """The 5th percentile of the pictures."""
+        return _psnr(percentile(sorted(self.errors[upscaler], reverse=True), 5))  # the greatest error is the least PSNR
 
     def _runs(self, views: set[View]) -> list[int]:
         return [len(list(run)) for within, run in groupby(self.views, lambda view: view in views) if within]

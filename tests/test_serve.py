@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hmac
+import sqlite3
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -169,6 +170,26 @@ def test_points_have_the_names_of_the_sweep_that_asks(tmp_path: Path) -> None:
         store.keep_sweep(AskedSweep.of([*renamed, replace(first.point, fps=30)], []))
     newest, _ = StoreReader(tmp_path / "store").sweeps().values()
     assert {result.point.clip for result in StoreReader(tmp_path / "store").points(newest.asked)} == {"another name"}
+
+
+def test_latencies_have_the_names_of_the_sweep_that_asks(tmp_path: Path) -> None:
+    results, latencies = sweep_results(("map",), (540,)), latency_results()[:2]
+    filled(tmp_path / "store", results, latencies)
+    points = [replace(result.point, clip="another name", upscaler=f"my {result.point.upscaler}") for result in results]
+    reader = StoreReader(tmp_path / "store")
+    found = reader.latencies(AskedSweep.of(points, ["latency 0", "latency 1"]))
+    assert [(one.clip, one.upscaler) for one in found] == [("another name", f"my {one.upscaler}") for one in latencies]
+
+
+def test_a_damaged_record_is_a_sentence_in_the_services_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    of = settings(tmp_path)
+    sweep = filled(of.store, sweep_results(("map",), (540,)), [])
+    with sqlite3.connect(of.store) as connection:
+        connection.execute("UPDATE points SET record = replace(record, '\"flags\"', '\"banners\"')")
+    with serving(of) as client:
+        answer = client.get(f"/api/v1/sweeps/{sweep}/curves")
+        assert answer.status_code == 503 and "see the service's log" in answer.json()["detail"]
+    assert [record.message.startswith(f"the store {of.store} holds a record") for record in caplog.records] == [True]
 
 
 def test_models_come_with_their_cards(measured: tuple[httpx.Client, str]) -> None:

@@ -7,6 +7,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 from pathlib import Path
 
 import psutil
@@ -61,6 +62,13 @@ def test_what_it_cannot_use_is_one_sentence(tmp_path: Path, capsys: pytest.Captu
         assert "cannot listen on 127.0.0.1" in sentence
     (tmp_path / "data/service.sqlite").write_bytes((ROOT / "server/demo/sweep.sqlite").read_bytes())
     assert "not of this version of gamesr-serve" in refusal(capsys, *folders, "--store", tmp_path / "store")
+
+
+def test_an_address_that_cannot_be_printed_is_one_sentence() -> None:
+    command = [sys.executable, "-c", "from server.serve import main; raise SystemExit(main())", "--demo", "--no-runner", "--port", "0"]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 1 and done.stderr == "gamesr-serve: [Errno 28] No space left on device\n"
 
 
 def test_every_line_of_the_documentation_works_and_there_is_one_for_every_address(tmp_path: Path) -> None:

@@ -15,7 +15,10 @@ import httpx
 import numpy as np
 import pytest
 
+import server.library
 from client.errors import InputError
+from server.database import Database
+from server.library import Library
 from server.probe import probe
 from server.settings import Limits, Settings
 from tests.serving import serving, settings, until
@@ -215,6 +218,50 @@ def test_a_caller_that_hangs_in_mid_upload(client: httpx.Client, small: Settings
         answer = b"".join(iter(lambda: connection.recv(4096), b""))  # until the connection is closed
         assert answer.startswith(b"HTTP/1.1 408 ") and b"nothing came for 1 s" in answer
     assert list(small.uploads.iterdir()) == []
+
+
+def test_a_body_that_comes_byte_by_byte_has_to_end(tmp_path: Path) -> None:
+    with serving(settings(tmp_path, body_s=1.0)) as client, socket.create_connection(address(client), timeout=0.2) as connection:
+        connection.sendall(head(client, "POST", "/api/v1/client-latencies", 1000, "application/json"))
+        answer = b""
+        for _ in range(100):
+            with contextlib.suppress(TimeoutError):
+                if answer := connection.recv(4096):
+                    break
+            connection.sendall(b"{")
+        assert answer.startswith(b"HTTP/1.1 408 ")
+        connection.settimeout(10)
+        answer += b"".join(iter(lambda: connection.recv(4096), b""))  # until the connection is closed
+        assert b"it was not here after 1 s" in answer
+
+
+def test_an_upload_that_cannot_be_kept_is_not_its_callers_fault(client: httpx.Client, small: Settings) -> None:
+    small.uploads.rmdir()  # as little of it can be written as on a full disk
+    answer = client.post(CLIPS, content=b"x", headers=MP4)
+    assert answer.status_code == 503 and "see the service's log" in answer.json()["detail"]
+
+
+def test_a_caller_that_leaves_is_no_error_of_the_service(client: httpx.Client, small: Settings) -> None:
+    with socket.create_connection(address(client)) as connection:
+        connection.sendall(head(client, "POST", CLIPS, 10_000, "video/mp4") + b"x")
+        until(lambda: list(small.uploads.iterdir()))
+    until(lambda: 'method="POST",route="/clips",status="408"' in client.get("/metrics").text)
+
+
+def test_the_folder_is_read_once_for_all_of_its_clips(
+    tmp_path: Path, make_clip: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "clips").mkdir()
+    for number in range(3):
+        make_clip(f"clips/{number}.mkv", width=96, height=72, frames=5 + number)
+    of = settings(tmp_path, clips=tmp_path / "clips")
+    of.data.mkdir()
+    read: list[Path | None] = []
+    usable = server.library._usable
+    monkeypatch.setattr(server.library, "_usable", lambda folder: read.append(folder) or usable(folder))
+    clips, refused = Library(Database(of.database), of).clips()
+    assert [clip.name for clip in clips] == ["0.mkv", "1.mkv", "2.mkv"] and refused == {}
+    assert read == [of.clips, of.uploads]
 
 
 def test_a_caller_that_leaves_in_mid_upload_and_others_who_wait(client: httpx.Client, small: Settings) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -50,6 +51,8 @@ def test_the_command_prints_a_row_a_scene(make_clip: Callable[..., Path], capsys
     assert main([*arguments, "--json"]) == 0
     records = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [(record["scene"], record["rate_control"]) for record in records] == [(scene.__name__, rate) for scene, rate in ROWS]
+    sha256 = hashlib.sha256(find_model("bicubic", 2).read_bytes()).hexdigest()
+    assert {(record["model"], record["sha256"], record["provider"]) for record in records} == {("bicubic", sha256, "cpu")}
 
 
 @pytest.mark.parametrize(("size", "frames"), [((64, 50), 8), ((64, 48), 5)])

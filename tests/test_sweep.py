@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
+import shutil
 import weakref
 from collections.abc import Callable, Generator
 from dataclasses import fields, replace
@@ -13,14 +16,15 @@ import pytest
 
 import server.job
 from client.cloud import CloudEncoder, CloudSettings, area_downscale, through_codec
-from client.cores import machine_name
+from client.cores import machine_name, physical_cores
 from client.frames import Frame
 from client.models import find_model
 from client.quality import Quality, QualityMeter
 from client.upscaler import OnnxUpscaler
 from client.video import read_frames
 from server.encoding import clip_frames
-from server.events import LatencyDone, LatencyReused, PlanMade, PointDone, PointFailed, Waiting, event_record
+from server.events import LatencyDone, LatencyReused, PlanMade, PointDone, PointFailed, PointReused, Waiting, event_record
+from server.latency import latency_key
 from server.points import DEADLINES_FPS, Flag, LatencyResult, Point, PointResult
 from server.store import Store
 from server.sweep import run_sweep
@@ -72,6 +76,32 @@ def test_a_second_sweep_computes_nothing(clip: Path, tmp_path: Path) -> None:
     assert not any(isinstance(event, PointDone) for event in second) and done(second).reused == 2 and done(second).overhead is None
     wider = sweep_here(plan_of(clip, upscalers="bicubic,lanczos", heights=[36]), tmp_path / "store")
     assert (done(wider).done, done(wider).reused) == (2, 2)
+
+
+def test_what_is_reused_has_the_names_of_who_asks(clip: Path, tmp_path: Path) -> None:
+    sweep_here(plan_of(clip, heights=[36], bitrates=[200]), tmp_path / "store")
+    renamed = clip.rename(tmp_path / "renamed.mkv")
+    mine = shutil.copy(find_model("bicubic", 2), tmp_path / "mine.onnx")
+    plan = plan_of(renamed, upscalers=f"none,{mine}", heights=[36], bitrates=[200], latency=True)
+    with Store(tmp_path / "store") as store:
+        for ask in (ask for job in plan.latency_jobs for ask in job.asks):
+            store.keep_latency(latency_key(ask), some_latency())
+    events = sweep_here(plan, tmp_path / "store")
+    points = [event.result.point for event in events if isinstance(event, PointReused)]
+    latencies = [event.result for event in events if isinstance(event, LatencyReused)]
+    for found in (points, latencies):
+        assert sorted((of.clip, of.upscaler) for of in found) == [("renamed", "mine"), ("renamed", "none")]
+
+
+def test_a_latency_taken_at_another_niceness_is_another_one(clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And at none it has the key that it had before niceness was in it."""
+    ask = plan_of(clip, upscalers="bicubic", heights=[36], bitrates=[200]).jobs[0].asks[0]
+    keys = []
+    for niceness in (0, 10):
+        monkeypatch.setattr(os, "nice", lambda _, niceness=niceness: niceness)
+        keys.append(latency_key(ask))
+    content = [ask.point.key, machine_name(), physical_cores(), 100]
+    assert keys[0] == hashlib.sha256(json.dumps(content).encode()).hexdigest() != keys[1]
 
 
 def test_the_key_depends_on_every_input_and_on_no_name() -> None:

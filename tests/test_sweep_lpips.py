@@ -73,6 +73,7 @@ def test_other_files_are_refused_in_one_sentence(make_clip: Callable[..., Path],
     half, lone = distance_model(tmp_path / "h.onnx", kind=TensorProto.DOUBLE), distance_model(tmp_path / "l.onnx", inputs=1)
     for path, sentence in (
         (tmp_path / "none.onnx", "cannot be read"),
+        (Path("/dev/null"), "is not a file"),
         (text, "not a readable ONNX model"),
         (half, "is not LPIPS"),
         (lone, "is not LPIPS"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import sqlite3
 import time
@@ -14,7 +15,9 @@ import pytest
 
 from client.errors import OutputError
 from client.quality import Quality
+from server.asked import AskedSweep
 from server.points import Point, PointResult
+from server.reading import StoreReader
 from server.store import SCHEMA_VERSION, Store
 from tests.sweeping import some_latency
 
@@ -35,6 +38,46 @@ def test_what_is_kept_is_there_for_the_next_and_the_first_of_two_stays(tmp_path:
         with sqlite3.connect(tmp_path / "store") as connection:
             assert connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
             assert connection.execute("PRAGMA user_version").fetchone() == (SCHEMA_VERSION,)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        '{"',
+        "[]",
+        "{}",
+        "[" * 100_000,
+        *(
+            json.dumps({**result(1).record(), **change})
+            for change in ({"more": 1}, {"flags": ["SIDEWAYS"]}, {"bitrate_kbps": float("nan")}, {"bitrate_kbps": "fast"}, {"point": {}})
+        ),
+        json.dumps(result(1).record()).replace("201.5", "1e999"),
+        json.dumps(result(1).record()).replace('"vmaf": "none"', '"vmaf": 0'),
+    ],
+    ids=range(11),
+)
+def test_a_record_that_no_sweep_has_written_is_one_sentence_with_the_stores_name(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "store"
+    point, asked = result(1).point, AskedSweep.of([result(1).point], ["key"])
+    with Store(path) as store:
+        store.keep_point(result(1))
+        store.keep_latency("key", some_latency())
+        store.keep_sweep(asked)
+        reader = StoreReader(path)
+        for table in ("points", "latencies", "sweeps"):
+            store._connection.execute(f"UPDATE {table} SET record = ?", (damage,))
+        for read in (
+            lambda: store.point(point.key),
+            lambda: store.latency("key"),
+            lambda: reader.points(asked),
+            lambda: reader.latencies(asked),
+            reader.all_latencies,
+            reader.sweeps,
+            lambda: reader.sweep(asked.key),
+        ):
+            with pytest.raises(OutputError, match="holds a record that is damaged") as caught:
+                read()
+            assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_all_of_many_sweeps_that_begin_at_once_open_one_new_store(tmp_path: Path) -> None:

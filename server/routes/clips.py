@@ -9,8 +9,9 @@ from typing import Annotated, Any
 
 from anyio import to_thread
 from fastapi import APIRouter, Depends, HTTPException, Path, Query, Request, Response
+from starlette.requests import ClientDisconnect
 
-from client.errors import InputError
+from client.errors import InputError, OutputError
 from server.guards import require_key
 from server.library import UPLOADED
 from server.requests import NAME, ClipList, StoredClip
@@ -73,6 +74,10 @@ async def upload_clip(
     except InputError as error:
         service.monitoring.uploads_refused.inc()
         raise HTTPException(422, str(error)) from None
+    except ClientDisconnect:
+        raise HTTPException(408, "the caller left before all of it was here") from None  # nobody reads it; it is counted
+    except OSError as error:
+        raise OutputError(f"an upload cannot be kept in {service.settings.uploads}: {error.strerror}") from error
     finally:
         part.unlink(missing_ok=True)
         service.uploading.release()
