@@ -14,6 +14,7 @@ MAX_UNIT_BYTES = 8 << 20  # a second of 64 Mbps
 MAX_UNIT_PACKETS = 1 << 14
 _SLICE, _IDR_SLICE, _SEI, _SPS, _PPS, _DELIMITER = 1, 5, 6, 7, 8, 9  # nal_unit_type, table 7-1
 _RECOVERY_POINT = 6  # SEI payloadType, D.1.1
+_SEI_BYTES, _SEI_UNITS = 512, 16  # that are looked into: megabytes of them would keep the receiver from its packets for seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,6 +208,7 @@ def inspect(data: bytes) -> Content:
     kinds: list[int] = []
     headed = opens = reference = sliced = False
     recovery: int | None = None
+    looked_into = 0
     for unit in nal_units(data):
         kind = unit[0] & 0x1F
         kinds.append(kind)
@@ -215,14 +217,18 @@ def inspect(data: bytes) -> Content:
                 opens = unit[1:2] >= b"\x80"  # first_mb_in_slice is 0, coded as one set bit
                 headed = kinds[0] == _DELIMITER or _SPS in kinds
             sliced, reference = True, unit[0] & 0x60 != 0
-        elif kind == _SEI and recovery is None:
+        elif kind == _SEI and recovery is None and looked_into < _SEI_UNITS:
             recovery = recovery_point(unit[1:])
+            looked_into += 1
     return Content(_IDR_SLICE in kinds, _SPS in kinds, headed, opens, reference, recovery)
 
 
 def recovery_point(sei: bytes) -> int | None:
-    """recovery_frame_cnt of an SEI's payload (D.1.8) that says exact_match_flag 1 and broken_link_flag 0, else None."""
-    octets = sei.replace(b"\0\0\3", b"\0\0")  # 7.4.1: emulation prevention
+    """recovery_frame_cnt of an SEI's payload (D.1.8) that says exact_match_flag 1 and broken_link_flag 0, else None.
+
+    What lies beyond the first 512 bytes is as if it were not there.
+    """
+    octets = sei[:_SEI_BYTES].replace(b"\0\0\3", b"\0\0")  # 7.4.1: emulation prevention
     position = 0
     while len(octets) - position > 2:  # the trailing bits are what is left
         kind, position = _extended(octets, position)

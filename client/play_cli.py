@@ -71,7 +71,9 @@ def parser() -> argparse.ArgumentParser:
         default=AUTO,
         help="what runs the networks (default: OpenVINO where it is installed, in bfloat16 where the processor has it, else cpu)",
     )
-    parser.add_argument("--threads", metavar="N", type=whole_number(), help="threads of the networks (default: the physical cores)")
+    parser.add_argument(
+        "--threads", metavar="N", type=whole_number(most=1024), help="threads of the networks (default: the physical cores)"
+    )
     parser.add_argument(
         "--deadline-ms", metavar="MS", type=_positive, help="from a frame's arrival to its presentation (default: one frame's duration)"
     )
@@ -112,6 +114,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         status = fail(PROGRAM, f"playing needs the extra `play`: {how_to_install('play')}")
     except BrokenPipeError:
         status = reader_gone()
+    except OSError as error:
+        if arguments.debug:
+            traceback.print_exc()
+        reader_gone()  # stdout may be what could not be written
+        status = fail(PROGRAM, f"{error.filename}: {error.strerror}" if error.filename else str(error))
     return asked.status or status
 
 

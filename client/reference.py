@@ -12,18 +12,18 @@ from client.errors import InputError
 from client.frames import Frame
 from client.quality import Quality, QualityMeter
 from client.video import VideoSource
+from client.whole_frames import whole_frames
 
 
 class Reference:
     """Measures several upscalers' pictures against one file as they come; a context manager.
 
-    Raises InputError when the file cannot be read, is damaged, or is not `width` x `height`.
+    Raises InputError when the file cannot be read, is damaged, or is not `width` x `height` throughout.
     """
 
     def __init__(self, path: Path, width: int, height: int, names: Sequence[str]) -> None:
-        self.path = path
         self.notes: list[str] = []
-        self._frames = 0
+        self._measured = 0
         self._missing = 0
         with ExitStack() as stack:
             self._source = stack.enter_context(VideoSource(path))
@@ -32,7 +32,7 @@ class Reference:
                     f"reference {path} is {self._source.width}x{self._source.height}, but the upscaled picture is {width}x{height}"
                 )
             self._meters = {name: stack.enter_context(QualityMeter(width, height)) for name in names}
-            self._decoded = iter(self._source)
+            self._frames = whole_frames(self._source)
             self._stack = stack.pop_all()
 
     def __enter__(self) -> Self:
@@ -43,24 +43,18 @@ class Reference:
 
     def add(self, pictures: Mapping[str, Frame]) -> None:
         """Measure the next frame's pictures, by name; beyond the end of the reference they are only counted."""
-        reference = self._next()
+        reference = next(self._frames, None)
         if reference is None:
             self._missing += 1
             return
         for name, meter in self._meters.items():
             meter.add(reference, pictures[name])
-        self._frames += 1
+        self._measured += 1
 
     def result(self) -> dict[str, Quality]:
         """The figures by name; ends the measurement. `notes` then says where the lengths differ."""
         if self._missing:
-            self.notes.append(f"the reference ends after {self._frames} frames: the last {self._missing} were not measured")
-        elif self._next() is not None:
-            self.notes.append(f"the reference is longer than the {self._frames} frames that were measured")
+            self.notes.append(f"the reference ends after {self._measured} frames: the last {self._missing} were not measured")
+        elif next(self._frames, None) is not None:
+            self.notes.append(f"the reference is longer than the {self._measured} frames that were measured")
         return {name: meter.result() for name, meter in self._meters.items()}
-
-    def _next(self) -> Frame | None:
-        item = next(self._decoded, None)
-        if self._source.decode_errors:
-            raise InputError(f"reference {self.path} is damaged: nothing can be measured against it")
-        return None if item is None else item.frame

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import cast
@@ -17,7 +18,8 @@ from client.errors import InputError
 from client.frames import Frame
 from client.rtp import CLOCK_HZ
 from client.sender import Unit
-from client.video import VideoSource, open_local, read_frames
+from client.video import VideoSource, open_local
+from client.whole_frames import check_size
 
 KEPT_BYTES = 512 << 20  # of a clip that is repeated: reducing 1080p costs as much time as encoding the result
 
@@ -25,7 +27,7 @@ KEPT_BYTES = 512 << 20  # of a clip that is repeated: reducing 1080p costs as mu
 class EncodedLive:
     """A clip, downscaled by area to `height` and encoded frame by frame when each is due; an IDR whenever it is asked for.
 
-    Raises InputError for a clip that cannot be read, or whose height and width are not whole even multiples.
+    Raises InputError for a clip that cannot be read, whose height and width are not whole even multiples, or that changes its size.
     """
 
     answers_requests = True
@@ -67,15 +69,17 @@ class EncodedLive:
             yield from self._reduced() if kept is None else kept
 
     def _reduced(self) -> Iterator[Frame]:
-        for frame in read_frames(self._path):
-            yield area_downscale(frame, self._scale) if self._scale > 1 else frame
+        with VideoSource(self._path) as source:
+            for decoded in source:
+                check_size(source, decoded.frame)
+                yield area_downscale(decoded.frame, self._scale) if self._scale > 1 else decoded.frame
 
 
 class EncodedFile:
     """A file's H.264, packet by packet as it was encoded, at its own timestamps or at `fps` pictures a second.
 
-    It cannot make an IDR that it does not have. Raises InputError for a file that cannot be read or holds no H.264, and with
-    `fps` for one whose pictures are not in order.
+    It cannot make an IDR that it does not have. Packets that are no H.264 are left out, and a file that breaks off ends there.
+    Raises InputError for a file that cannot be read or holds no H.264, and with `fps` for one whose pictures are not in order.
     """
 
     answers_requests = False
@@ -122,21 +126,33 @@ class EncodedFile:
             stream = container.streams.best("video")
             if not isinstance(stream, VideoStream) or stream.codec_context is None or stream.codec_context.name != "h264":
                 raise InputError(f"{self._path} holds no H.264: leave out --copy to have it encoded")
-            annex_b = BitStreamFilterContext("h264_mp4toannexb", stream)
+            try:
+                annex_b = BitStreamFilterContext("h264_mp4toannexb", stream)
+            except av.FFmpegError as error:
+                raise InputError(f"{self._path} has damaged parameter sets: nothing in it can be decoded") from error
             period = Fraction(1, self._fps) if self._fps else 1 / Fraction(stream.guessed_rate or 30)
             tick = stream.time_base or Fraction(1, CLOCK_HZ)
             first_dts: int | None = None
-            index = 0
-            for packet in container.demux(stream):
-                if not packet.size:
-                    continue
-                for filtered in cast("list[av.Packet[VideoStream]]", annex_b.filter(packet)):
-                    decode_at = show_at = index * period
-                    if self._fps is None and filtered.dts is not None and filtered.pts is not None:
-                        first_dts = filtered.dts if first_dts is None else first_dts
-                        decode_at = (filtered.dts - first_dts) * tick
-                        show_at = (filtered.pts - first_dts) * tick
-                    elif filtered.pts != filtered.dts:
-                        raise InputError(f"the pictures of {self._path} are not in order (B-frames): leave out --fps")
-                    yield decode_at, show_at, bytes(filtered)
-                    index += 1
+            for index, filtered in enumerate(_filtered(container.demux(stream), annex_b)):
+                decode_at = show_at = index * period
+                if self._fps is None and filtered.dts is not None and filtered.pts is not None:
+                    first_dts = filtered.dts if first_dts is None else first_dts
+                    decode_at = (filtered.dts - first_dts) * tick
+                    show_at = (filtered.pts - first_dts) * tick
+                elif filtered.pts != filtered.dts:
+                    raise InputError(f"the pictures of {self._path} are not in order (B-frames): leave out --fps")
+                yield decode_at, show_at, bytes(filtered)
+
+
+def _filtered(packets: Iterator[av.Packet[VideoStream]], annex_b: BitStreamFilterContext) -> Iterator[av.Packet[VideoStream]]:
+    """What can be read and sent of a file that may be damaged or cut short."""
+    while True:
+        try:
+            packet = next(packets, None)
+        except av.FFmpegError:
+            return  # it cannot be read further
+        if packet is None:
+            return
+        if packet.size:
+            with suppress(av.FFmpegError):
+                yield from cast("list[av.Packet[VideoStream]]", annex_b.filter(packet))

@@ -38,8 +38,8 @@ class TieredUpscaler:
     With the step after that, the chosen model's memory begins anew: no memory is used by another network, nor one that missed frames.
     A model without memory is not run for a frame equal to the one before, whose picture is shown again; but where it is not the
     best, for one in `MOST_REPEATS` + 1 of them.
-    All buffers are made before a tier can be chosen (`prepare` waits for all of them), none by a switch. `display_height` chooses the scale, 2 or 3,
-    that comes nearest to it; without, it is 2.
+    All buffers are made before a tier can be chosen (`prepare` waits for all of them), none by a switch. `display_height` chooses the
+    scale, 2 or 3, that comes nearest to it; without, it is 2.
     It serves one stream at a time. Raises ModelError for what does not ship at the scale, and what `OnnxUpscaler` raises.
     """
 

@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from statistics import fmean
 from typing import Any
+
+import onnxruntime
 
 from client.errors import InputError, ModelError
 from client.models import find_model
 from client.pipeline import upscale_stream
 from client.quality import QualityMeter
+from client.runtime import OPENVINO, openvino
 from client.sink import NullSink
 from client.upscaler import OnnxUpscaler
 from client.video import Decoded
+from client.vmaf import why_unavailable
 from model.footage import Degradation, FootageCache, Pair, Scene, load_pairs
 
 Row = dict[str, Any]
-_KEY = ("clip", "footage", "scale", "model", "sha256", "frames", "provider")
+_KEY = ("clip", "footage", "scale", "model", "sha256", "frames", "provider", "versions")
+_BEGINNING = b'{"clip": '  # of every row
 
 
 def evaluate(
@@ -39,8 +46,9 @@ def evaluate(
     Rows are told apart by the model's name, so two artifacts of one name are refused, and an artifact named twice has one row.
 
     Speed is not measured here but by gamesr-bench, so rows may be made while something else runs. A row is known by clip,
-    its footage's digest, scale, number of frames, provider and the artifact's digest; what its card says of parameters and
-    multiply-accumulates stands in the row too. Raises what reading footage and models raises.
+    its footage's digest, scale, number of frames, provider, the artifact's digest and the versions of what computes and measures;
+    what its card says of parameters and multiply-accumulates stands in the row too. A last row that was not written to its end,
+    by a run that was killed, is cut off. Raises what reading footage and models raises.
     """
     known = _read_rows(store)
     upscalers = {scale: _upscalers([find_model(name, scale) for name in models], provider, threads) for scale in scales}
@@ -50,7 +58,7 @@ def evaluate(
                 for upscaler in upscalers[scale]:
                     spec = upscaler.spec
                     values = pair.title, pair.low.digest, scale, spec.name, spec.sha256, min(frames, len(pair)), provider
-                    key = dict(zip(_KEY, values, strict=True))
+                    key = dict(zip(_KEY, (*values, _versions(pair, provider)), strict=True))
                     row = known.get(json.dumps(key))
                     if row is None:
                         row = {**key, **_measure(pair, upscaler, frames)}
@@ -84,15 +92,31 @@ def _decoded(pair: Pair, frames: int) -> Iterator[Decoded]:
         yield Decoded(pair.low.frame(index), now, now)
 
 
+def _versions(pair: Pair, provider: str) -> dict[str, str]:
+    """What decides a figure beside its inputs: a row of other versions, or of a time without VMAF, is measured again."""
+    versions = {"onnxruntime": onnxruntime.__version__}
+    if provider in OPENVINO:
+        versions["openvino"] = openvino().__version__
+    return versions | {"vmaf": why_unavailable(pair.high.width, pair.high.height) or f"imageio-ffmpeg {version('imageio-ffmpeg')}"}
+
+
 def _read_rows(store: Path) -> dict[str, Row]:
+    """The rows of a file by their keys; cuts off a last one that has no end."""
     rows: dict[str, Row] = {}
-    if store.exists():
-        for line in store.read_text().splitlines():
-            try:
-                row = json.loads(line)
-                rows[json.dumps({k: row[k] for k in _KEY})] = row
-            except (ValueError, KeyError) as error:
-                raise InputError(f"{store} is not a file of rows as this gamesr-evaluate makes them: {error}") from error
+    content = store.read_bytes() if store.exists() else b""
+    whole = content[: content.rfind(b"\n") + 1]
+    begun = content[len(whole) :]
+    try:
+        for line in whole.splitlines():
+            row = json.loads(line)
+            key = {name: row[name] for name in _KEY[:-1]} | {"versions": row.get("versions")}  # which older rows lack: they fit nothing
+            rows[json.dumps(key)] = row
+        if begun[: len(_BEGINNING)] != _BEGINNING[: len(begun)]:
+            raise ValueError("it does not end as a row would")
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"{store} is not a file of rows as this gamesr-evaluate makes them: {error}") from error
+    if begun:
+        os.truncate(store, len(whole))
     return rows
 
 

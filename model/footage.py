@@ -19,8 +19,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import tomllib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -31,10 +32,12 @@ from numpy.typing import NDArray
 from client.cloud import CloudSettings, area_downscale, through_codec
 from client.errors import InputError
 from client.frames import Frame
-from client.video import read_frames
+from client.video import VideoSource
+from client.whole_frames import whole_frames
 
 CACHE_VERSION = 1
 CROP_CANDIDATES = 8
+MAX_FPS = 1000
 
 
 @dataclass(frozen=True)
@@ -58,18 +61,10 @@ def load_scenes(footage: Path, *, split: str, games: Iterable[str] = ()) -> list
     """The scenes of one split, of the given games or of all; raises InputError when the list is unreadable or nothing is left."""
     try:
         rows = tomllib.loads(footage.read_text())["scene"]
-        scenes = [
-            Scene(
-                **{key: row[key] for key in ("name", "game", "split", "fps")},
-                reference=footage.parent / row["reference"],
-                native={int(height): footage.parent / path for height, path in row.get("native", {}).items()},
-                antialiased=footage.parent / row["antialiased"] if "antialiased" in row else None,
-            )
-            for row in rows
-        ]
+        scenes = [_scene(row, footage.parent) for row in rows]
     except OSError as error:
         raise InputError(f"{footage} cannot be read: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{footage} is not a footage list: {error}") from error
     by_name: dict[str, str] = {}
     for scene in scenes:
@@ -80,6 +75,27 @@ def load_scenes(footage: Path, *, split: str, games: Iterable[str] = ()) -> list
     if not chosen:
         raise InputError(f"{footage} has no {split} scene of {', '.join(sorted(wanted))}")
     return chosen
+
+
+def _scene(row: Mapping[str, object], folder: Path) -> Scene:
+    """A table of the list; raises what a table of another form leads to."""
+    name, game, split, reference = (_text(row[key]) for key in ("name", "game", "split", "reference"))
+    if len(f"{game}/{name}".split()) != 1:
+        raise ValueError(f"{game}/{name} has a space in it")  # rows of figures are told apart by title and degradation
+    fps, native = row["fps"], row.get("native", {})
+    if type(fps) is not int or not 1 <= fps <= MAX_FPS:
+        raise ValueError(f"fps is a whole number from 1 to {MAX_FPS}, not {fps!r}")
+    if not isinstance(native, dict):
+        raise TypeError(f"native has files by height, and is not {native!r}")
+    renders = {int(height): folder / _text(path) for height, path in native.items()}
+    antialiased = folder / _text(row["antialiased"]) if "antialiased" in row else None
+    return Scene(name, game, split, fps, folder / reference, renders, antialiased)
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} is not a text")
+    return value
 
 
 @dataclass(frozen=True)
@@ -96,11 +112,11 @@ class Degradation:
 
     @classmethod
     def parse(cls, text: str) -> Degradation:
-        how, at, bitrate = text.partition("@")
-        source, colon, target = how.partition(":")
-        if source not in ("area", "native") or (colon and target != "aa") or (at and not (bitrate.isdigit() and int(bitrate))):
+        found = re.fullmatch("(area|native)(:aa)?(?:@0*([1-9][0-9]{0,5}))?", text)
+        if not found:
             raise InputError(f"{text!r} is not a degradation: write area, native, area:aa or native:aa, and @4000 behind it for 4000 kbps")
-        return cls(source, int(bitrate) if bitrate else None, bool(colon))
+        source, antialiased, bitrate = found.groups()
+        return cls(source, int(bitrate) if bitrate else None, bool(antialiased))
 
     def __str__(self) -> str:
         return self.source + (":aa" if self.antialiased else "") + (f"@{self.bitrate_kbps}" if self.bitrate_kbps else "")
@@ -152,7 +168,7 @@ class FootageCache:
     def reference(self, scene: Scene, *, antialiased: bool = False) -> Take:
         """The scene as it should become; raises InputError when an anti-aliased one is wanted and there is none."""
         path = _target(scene, antialiased)
-        return self._take({"file": _digest(path)}, lambda: read_frames(path))
+        return self._take({"file": _digest(path)}, lambda: _film(path))
 
     def degraded(self, scene: Scene, scale: int, degradation: Degradation) -> Take:
         """The scene at 1/scale; raises InputError when a native render is wanted and there is none of that size."""
@@ -171,7 +187,7 @@ class FootageCache:
 
         def frames() -> Iterator[Frame]:
             if degradation.source == "native":
-                small: Iterator[Frame] = islice(read_frames(scene.native[reference.height // scale]), len(reference))
+                small: Iterator[Frame] = islice(_film(scene.native[reference.height // scale]), len(reference))
             else:
                 small = (area_downscale(reference.frame(i), scale) for i in range(len(reference)))
             return small if settings is None else through_codec(small, settings)
@@ -190,9 +206,17 @@ class FootageCache:
             if not rows:
                 raise InputError(f"no frames: {key}")
             partial = path.with_suffix(f".{os.getpid()}.npy")
-            np.save(partial, np.stack(rows))
-            partial.replace(path)
+            try:
+                np.save(partial, np.stack(rows))
+                partial.replace(path)
+            finally:
+                partial.unlink(missing_ok=True)
         return Take(np.load(path, mmap_mode="c"), digest)  # torch warns of arrays that it could not write to
+
+
+def _film(path: Path) -> Iterator[Frame]:
+    with VideoSource(path) as source:
+        yield from whole_frames(source)
 
 
 def _target(scene: Scene, antialiased: bool) -> Path:

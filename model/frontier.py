@@ -176,6 +176,8 @@ def measure(arguments: argparse.Namespace) -> list[Candidate]:
     for provider in dict.fromkeys([YARDSTICK_PROVIDER, *arguments.providers]):
         models = names if provider in arguments.providers else [YARDSTICK]
         rows += tqdm(_rows(models, provider, arguments), desc=provider, unit="row", disable=not sys.stderr.isatty())
+    if not rows:
+        raise InputError(f"no scene of {arguments.footage} was rendered for {' or '.join(arguments.degradations)}")
     gains = gains_over_bicubic(rows)
     candidates = []
     for (provider, model), (p50_ms, p95_ms) in _latencies(names, arguments).items():

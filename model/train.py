@@ -94,9 +94,16 @@ class Trainer:
         self.train = load_pairs(load_scenes(footage, split="train", games=config.games), cache, config.scale, degradations)
         held_out = load_scenes(footage, split="validate", games=config.games)
         self.validate = load_pairs(held_out, cache, config.scale, dict.fromkeys(degradations))
+        for split, pairs in (("train", self.train), ("validate", self.validate)):
+            if not pairs:
+                raise InputError(f"no {split} scene of {footage} was rendered for {' or '.join(dict.fromkeys(config.degradations))}")
         short = [pair.title for takes in self.train for pair in takes if len(pair) < config.frames]
         if short:
             raise InputError(f"{short[0]} is shorter than a clip of {config.frames} frames")
+        small = [pair for takes in self.train for pair in takes if min(pair.low.height, pair.low.width) < config.patch]
+        if small:
+            low = small[0].low
+            raise InputError(f"{small[0].title} is {low.width}x{low.height} at 1/{config.scale}, smaller than a patch of {config.patch}")
         torch.manual_seed(config.seed)
         self.network = config.network().to(self.device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -166,8 +173,11 @@ class Trainer:
             "held_out": self.held_out,
         }
         partial = self.folder / f"checkpoint.{os.getpid()}.partial"
-        torch.save(state, partial)
-        partial.replace(self.folder / "checkpoint.pt")
+        try:
+            torch.save(state, partial)
+            partial.replace(self.folder / "checkpoint.pt")
+        finally:
+            partial.unlink(missing_ok=True)
 
     def losses(self) -> Iterator[float]:
         """Train to the last step of the configuration, giving the loss after every step; checkpoints only fall between clips."""

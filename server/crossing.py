@@ -44,8 +44,6 @@ class Clip:
         self.references: list[Plane] = []
         self.reduced: list[Frame] = []
         for frame in clip_frames(path, 1, min(frames, kept)):
-            if frame.y.shape != size:
-                raise InputError(f"{path} changes its size in mid-stream, which cannot be measured")
             self.references.append(frame.y.copy())
             self.reduced.append(area_downscale(frame, self.scale))
 

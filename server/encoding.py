@@ -18,23 +18,13 @@ from client.cloud import CloudEncoder, CloudSettings
 from client.errors import InputError
 from client.frames import Frame
 from client.video import Decoded, VideoSource, from_av_frame
+from client.whole_frames import whole_frames
 
 
 def clip_frames(path: Path, step: int, limit: int | None) -> Generator[Frame]:
-    """Every `step`-th frame of a file, at most `limit`; raises InputError for a file that is unreadable, damaged or empty."""
+    """Every `step`-th frame of a file, at most `limit`; raises InputError for a file that is unreadable or, up to there, not whole."""
     with VideoSource(path) as source:
-        count = 0
-        for decoded in islice(source, 0, None, step):
-            if count == limit:
-                break
-            if source.decode_errors or decoded.frame.damaged:
-                raise InputError(f"{path} is damaged: nothing can be measured against it")
-            count += 1
-            yield decoded.frame
-        if source.decode_errors:
-            raise InputError(f"{path} is damaged: nothing can be measured against it")
-        if not count:
-            raise InputError(f"no frame of {path} could be decoded")
+        yield from islice(whole_frames(source), 0, limit and (limit - 1) * step + 1, step)
 
 
 class EncodedStream:

@@ -110,21 +110,14 @@ def _look(task: _Task) -> Known:
 
 def _decoded(source: object, most: int, task: _Task) -> int:
     from client.video import VideoSource
+    from client.whole_frames import whole_frames
 
     assert isinstance(source, VideoSource)
     frames = 0
-    for decoded in source:
+    for _ in whole_frames(source, "is damaged, or needs more memory to decode than it may have: nothing can be measured against it"):
         frames += 1
         if frames > most:
             raise InputError(_too_many(frames, most, task))
-        if (decoded.frame.width, decoded.frame.height) != (source.width, source.height):
-            raise InputError("the clip changes its size: cut it into clips of one size")
-        if source.decode_errors or decoded.frame.damaged:
-            break
-    if source.decode_errors or (frames and decoded.frame.damaged):
-        raise InputError("the clip is damaged, or needs more memory to decode than it may have: nothing can be measured against it")
-    if not frames:
-        raise InputError("no frame of the clip can be decoded")
     return frames
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import zlib
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +12,7 @@ import numpy as np
 import onnx
 import pytest
 
-from client import bench
+from client import bench, synthetic
 from client.bench import main
 from client.errors import GamesrError
 from client.measurement import WARM_UP_FRAMES, Task, measure, measure_in_fresh_process
@@ -34,6 +36,17 @@ def test_the_made_clip_is_the_same_every_time_and_moves(tmp_path: Path, clip: Pa
     assert np.array_equal(frames[1].y[:32, :40], frames[0].y[1:33, 3:43]) and not np.array_equal(frames[1].y, frames[0].y)
     decoded = list(read_frames(clip))
     assert len(decoded) == WARM_UP_FRAMES + 3 and decoded[0].y.shape == (48, 64) and decoded[0].colour.matrix == 1
+
+
+def test_a_long_made_clip_scrolls_over_a_wall_that_does_not_grow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gigabytes for ten thousand frames otherwise. What needs no more steps has the pictures that it always had."""
+    assert zlib.crc32(b"".join(plane.tobytes() for f in synthetic_frames(64, 48, 35) for plane in (f.y, f.u, f.v))) == 3278776385
+    walls: list[int] = []
+    noise = synthetic._noise
+    monkeypatch.setattr(synthetic, "_noise", lambda rng, high, wide, cell: walls.append(high * wide) or noise(rng, high, wide, cell))
+    before, after = deque(synthetic_frames(64, 48, 1000), 2)
+    assert max(walls) < 350 * 900
+    assert np.array_equal(after.y[:32, :40], before.y[1:33, 3:43]) and not np.array_equal(after.y, before.y)
 
 
 def test_a_run_counts_only_frames_after_the_warm_up(clip: Path) -> None:

@@ -163,6 +163,15 @@ def test_two_models_of_one_name_are_refused(
     assert said.startswith(f"{PROGRAM}: {one} and {other} are different models of one name, 'tiny'") and said.count("\n") == 1
 
 
+def test_no_scene_that_was_rendered_for_it_is_said_before_anything_is_timed(
+    footage: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("model.frontier.measure_in_fresh_process", lambda task: pytest.fail("it was timed"))
+    command = [str(footage), "--degradations", "native", "native:aa", "--rows", str(tmp_path / "rows"), "--cache", str(tmp_path / "cache")]
+    assert main(command) == 1
+    assert capsys.readouterr().err == f"{PROGRAM}: no scene of {footage} was rendered for native or native:aa\n"
+
+
 def test_what_cannot_be_done_is_said_in_a_sentence(footage: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(tmp_path / "missing.toml")]) == 1
     assert main([str(footage), "--models", "no-such-model"]) == 1

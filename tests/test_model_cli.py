@@ -172,6 +172,54 @@ def test_evaluate_knows_a_row_by_its_footage_and_not_by_the_scenes_name(
     assert found[0]["clip"] == found[1]["clip"] and found[0]["psnr_y_db"] != found[1]["psnr_y_db"]
 
 
+@pytest.fixture
+def measured(workshop: Path, tmp_path: Path) -> list[str]:
+    """A command that measures bicubic once, into rows.jsonl."""
+    again = ["--cache", str(workshop / "cache"), "--rows", str(tmp_path / "rows.jsonl"), "--models", "bicubic", "--scales", "2"]
+    command = [str(workshop / "footage.toml"), "--degradations", "area", "--frames", "2", *again]
+    assert evaluate_main(command) == 0
+    return command
+
+
+def test_a_row_of_other_versions_is_measured_again(measured: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = tmp_path / "rows.jsonl"
+    (first,) = map(json.loads, rows.read_text().splitlines())
+    rows.write_text(json.dumps({name: value for name, value in first.items() if name != "versions"}) + "\n")  # as they were made once
+    for module, name, value in (("onnxruntime", "__version__", "0"), ("model.evaluate", "why_unavailable", lambda *_: "no VMAF here")):
+        for _ in range(2):
+            assert evaluate_main(measured) == 0
+        monkeypatch.setattr(f"{module}.{name}", value)
+    for _ in range(2):
+        assert evaluate_main([*measured, "--provider", "openvino"]) == 0
+    before, second, third, fourth = map(json.loads, rows.read_text().splitlines())
+    assert "versions" not in before and second == first and set(first["versions"]) == {"onnxruntime", "vmaf"}
+    assert third["versions"] == first["versions"] | {"onnxruntime": "0"}
+    assert fourth["versions"]["vmaf"] == "no VMAF here" and fourth["versions"]["openvino"]
+
+
+@pytest.mark.parametrize("kept", [1, 40])
+def test_a_row_that_a_killed_run_left_unfinished_is_measured_again(measured: list[str], tmp_path: Path, kept: int) -> None:
+    rows = tmp_path / "rows.jsonl"
+    row = rows.read_bytes()
+    other = row.replace(b'"provider": "cpu"', b'"provider": "elsewhere"')
+    rows.write_bytes(other + row[:kept])
+    assert evaluate_main(measured) == 0
+    assert rows.read_bytes() == other + row
+
+
+@pytest.mark.parametrize("content", [b"[1]\n", b"3\n", b"{}\n", b"\xff\n", b"[" * 100_000 + b"\n", b'{"a": 1}', b"notes"])
+def test_a_file_of_something_else_is_refused_and_left_alone(
+    measured: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], content: bytes
+) -> None:
+    rows = tmp_path / "rows.jsonl"
+    rows.write_bytes(content)
+    capsys.readouterr()
+    assert evaluate_main(measured) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f"gamesr-evaluate: {rows} is not a file of rows") and said.count("\n") == 1
+    assert rows.read_bytes() == content
+
+
 def test_evaluate_measures_each_row_once(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = [str(workshop / "footage.toml"), "--cache", str(workshop / "cache"), "--rows", str(workshop / "rows.jsonl")]
     command += [

@@ -1,11 +1,13 @@
-"""What a player posts of itself: times of one model, at one size, that a service may hold against its own."""
+"""What a player says of itself: a summary that is printed, and times of one model, at one size, that are posted to a service."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
+from client import play_cli
 from client.errors import OutputError
 from client.pipeline import FrameDone
 from client.play_source import Arrived, Idle
@@ -67,3 +69,19 @@ def test_nothing_of_another_size_is_posted(tiers: TieredUpscaler, monkeypatch: p
     summary.tally.resize((32, 32))
     with pytest.raises(OutputError, match="no picture of the last size"):
         summary.posted()
+
+
+@pytest.mark.parametrize("output", [["--json"], []])
+def test_a_summary_that_cannot_be_printed_is_one_sentence(
+    make_clip: Callable[..., Path],
+    model_file: Callable[..., Path],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    output: list[str],
+) -> None:
+    with Path("/dev/full").open("w") as full:
+        monkeypatch.setattr("sys.stdout", full)
+        command = [str(make_clip()), "--model", str(model_file()), "--sink", "null", "--provider", "cpu", "--deadline-ms", "100000"]
+        assert play_cli.main([*command, "--threads", "1", *output]) == 1
+    said = capsys.readouterr().err
+    assert said.endswith("\ngamesr-play: [Errno 28] No space left on device\n") and "Traceback" not in said

@@ -260,6 +260,14 @@ def test_recovery_points_are_read_behind_any_other_message(count: int, exact: bo
     assert inspect(b"\0\0\1\6" + bytes(escaped) + b"\0\0\1\x41\x9a").recovery_frames == expected
 
 
+def test_of_many_messages_only_the_first_are_looked_into() -> None:
+    """Megabytes of them, octet by octet, would keep the receiver from its packets for seconds."""
+    other, point, start = b"\5\1\x11", b"\6\1\xc4", b"\0\0\1\6"
+    assert [recovery_point(other * count + point + b"\x80") for count in (0, 160, 180, 1_000_000)] == [0, 0, None, None]
+    units = [(start + other + b"\x80") * count + start + point + b"\x80" for count in (15, 16)]
+    assert [inspect(unit).recovery_frames for unit in units] == [0, None]
+
+
 @given(st.binary(max_size=64))
 def test_any_sei_is_read(sei: bytes) -> None:
     assert (recovery_point(sei) or 0) >= 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -101,6 +102,40 @@ def test_the_command_trains_logs_and_refuses_another_configuration(
     network_of(load_checkpoint(run / "checkpoint.pt"))
 
 
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"patch": 64}, "a/one area is 72x48 at 1/2, smaller than a patch of 64"),
+        ({"frames": 14}, "a/one area is shorter than a clip of 14 frames"),
+        ({"degradations": ("native",)}, "no validate scene of .* was rendered for native"),
+        ({"degradations": ("area:aa", "area:aa")}, "no train scene of .* was rendered for area:aa$"),
+    ],
+)
+def test_footage_that_does_not_suffice_is_refused_before_training(
+    footage: Path, tmp_path: Path, change: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(InputError, match=sentence):
+        Trainer(TrainConfig(**{**TINY.__dict__, **change}), footage, FootageCache(tmp_path / "cache"), tmp_path / "run")
+
+
+def test_what_cannot_be_written_to_its_end_leaves_nothing(footage: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(first: object, second: object) -> None:
+        path = first if isinstance(first, Path) else second
+        assert isinstance(path, Path)
+        path.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    cache = FootageCache(tmp_path / "cache")
+    trainer = Trainer(TINY, footage, cache, tmp_path / "run")
+    kept = sorted(tmp_path.rglob("*"))
+    monkeypatch.setattr(torch, "save", full)
+    monkeypatch.setattr(np, "save", full)
+    for write in (trainer.save, lambda: cache.degraded(load_scenes(footage, split="test")[0], 3, Degradation("area"))):
+        with pytest.raises(OSError, match="No space"):
+            write()
+    assert sorted(tmp_path.rglob("*")) == kept
+
+
 def test_a_batch_is_a_function_of_seed_and_index(footage: Path, tmp_path: Path) -> None:
     pairs = load_pairs(load_scenes(footage, split="train"), FootageCache(tmp_path), 2, [Degradation("area")])
     games = by_game(pairs)
@@ -158,14 +193,18 @@ def test_the_cloud_encoder_holds_nothing_back() -> None:
     assert encoder.flush() == []
 
 
-@pytest.mark.parametrize("text", ["box", "area@", "area@x", "native@0", "area@-1", ""])
+@pytest.mark.parametrize("text", ["box", "area@", "area@x", "native@0", "area@-1", "", "area:", "area@²", "area@٣", "area@" + "9" * 5000])
 def test_an_unknown_degradation_is_refused(text: str) -> None:
     with pytest.raises(InputError, match="not a degradation"):
         Degradation.parse(text)
 
 
 def test_a_degradation_is_read_as_it_is_written() -> None:
-    assert [str(Degradation.parse(text)) for text in ("area", "native@4000")] == ["area", "native@4000"]
+    texts = ["area", "native@4000", "area:aa", "native:aa@1"]
+    assert [str(Degradation.parse(text)) for text in texts] == texts
+
+
+SCENE = '[[scene]]\nname="a"\ngame="g"\nsplit="train"\nfps=30\nreference="x"\n'
 
 
 @pytest.mark.parametrize(
@@ -180,6 +219,15 @@ def test_a_degradation_is_read_as_it_is_written() -> None:
             "two splits",
         ),
         ('[[scene]]\nname="a"\ngame="g"\nsplit="test"\nfps=30\nreference="x"', "no train scene"),
+        (SCENE.replace("30", "0"), "fps is a whole number from 1 to 1000, not 0"),
+        (SCENE.replace("30", '"30"'), "fps is a whole number"),
+        (SCENE.replace("30", "true"), "fps is a whole number"),
+        (SCENE.replace('"g"', '["g"]'), "is not a text"),
+        (SCENE.replace('"a"', '"a b"'), "has a space in it"),
+        (SCENE + 'native=["x"]', "native has files by height"),
+        (SCENE + "native={540=3}", "is not a text"),
+        (SCENE + "antialiased=3", "is not a text"),
+        ("scene = " + "[" * 5000, "not a footage list"),
     ],
 )
 def test_a_bad_footage_list_is_refused(tmp_path: Path, content: str, reason: str) -> None:
