@@ -33,7 +33,7 @@ from model.train import source_commit
 
 FRAMES = 24  # of each clip, over which a state is carried
 EVERY = 6  # of which one in so many is looked at
-SHARE = 1 / 27  # of its cells: neighbours say nearly the same
+SHARE = 1 / 9  # of its cells, others in every frame of every clip: what lies in the same place in all of a game, as its HUD, is no sample
 ROUNDS = 12  # more change nothing that a float32 holds
 RIDGE = 1e-7  # of the mean square of a feature: for features that are never anything but zero
 
@@ -71,6 +71,7 @@ def sums_of(network: Network, layer: LastLayer, pair: Pair) -> Sums:
     hook = layer.module.register_forward_pre_hook(lambda module, inputs: features.append(inputs[0][:, : layer.features]))
     sums: list[Any] = [0, 0, 0]
     looked_at = range(min(2, frames - 1), frames, EVERY)
+    places = np.random.default_rng(list(pair.title.encode()))
     try:
         with torch.no_grad():
             state = network.initial_state(1, pair.low.height, pair.low.width)
@@ -82,7 +83,7 @@ def sums_of(network: Network, layer: LastLayer, pair: Pair) -> Sums:
                     wanted = torch.cat(
                         [F.pixel_unshuffle(plane, side) for plane, side in zip(_planes(pair.high, index), layer.sides, strict=True)], 1
                     )
-                    new = _sums(features[0], (wanted - torch.cat(cells, 1)), layer.padding, index)
+                    new = _sums(features[0], wanted - torch.cat(cells, 1), layer.padding, places)
                     sums = [old + part / len(looked_at) for old, part in zip(sums, new, strict=True)]
     finally:
         hook.remove()
@@ -97,11 +98,11 @@ def _kept_in(cells: list[Tensor]) -> Callable[[Tensor], Tensor]:
     return keep
 
 
-def _sums(features: Tensor, errors: Tensor, padding: int, seed: int) -> list[Array]:
+def _sums(features: Tensor, errors: Tensor, padding: int, places: np.random.Generator) -> list[Array]:
     """Of one frame; a one beside the features stands for the biases."""
     padded = F.pad(features[0], (padding,) * 4)
     columns, cells = errors.shape[3], errors.shape[2] * errors.shape[3]
-    chosen = torch.randperm(cells, generator=torch.Generator().manual_seed(seed))[: max(1, round(SHARE * cells))]
+    chosen = torch.from_numpy(places.permutation(cells)[: max(1, round(SHARE * cells))])
     corners = chosen // columns * padded.shape[2] + chosen % columns  # of each one's window of 3x3
     offsets = (torch.arange(3)[:, None] * padded.shape[2] + torch.arange(3)).flatten()
     windows = padded.flatten(1)[:, (corners[:, None] + offsets).flatten()].reshape(len(padded), len(chosen), 9)
