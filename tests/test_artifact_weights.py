@@ -12,7 +12,7 @@ import torch
 from client.errors import GamesrError, ModelError
 from client.models import find_model
 from client.upscaler import OnnxUpscaler
-from model.artifact_weights import network_of_artifact, run_of_artifact
+from model.artifact_weights import network_of_artifact, refitting, run_of_artifact
 from model.catalogue import network_of_preset
 from model.complexity import parameter_count
 from model.export import export_baseline, export_network
@@ -64,7 +64,8 @@ def test_a_run_goes_on_from_an_artifact_that_ships(name: str, footage: Path, tmp
         torch.testing.assert_close(a, b, rtol=0, atol=0.02)  # codes
     next(trainer.losses())
     card = OnnxUpscaler(artifact, threads=1).spec.card
-    assert [run["command"] for run in trainer.before] == [*(run["command"] for run in card["before"]), card["command"]]
+    refitted = [refitting(card["refit"])] if "refit" in card else []
+    assert [run["command"] for run in trainer.before] == [*(run["command"] for run in card["before"]), card["command"], *refitted]
     began = network_of_preset(preset, 2)
     began.load_state_dict(run_of_artifact(artifact)["network"])
     moved = [not torch.equal(now, described) for now, described in zip(trainer.network.parameters(), began.parameters(), strict=True)]
