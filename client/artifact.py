@@ -95,9 +95,10 @@ def read_artifact(model: Path) -> bytes:
     """The bytes of a file that could be an artifact; raises ModelError."""
     model = Path(model)
     try:
-        if not stat.S_ISREG(model.stat().st_mode):  # a pipe or a device has no size to be held against a limit
+        status = model.stat()
+        if not stat.S_ISREG(status.st_mode):  # a pipe or a device has no size to be held against a limit
             raise ModelError(f"model {model} is not a file")
-        if model.stat().st_size > MAX_FILE_BYTES:
+        if status.st_size > MAX_FILE_BYTES:
             raise ModelError(f"{model} is larger than {MAX_FILE_BYTES // 2**20} MiB: it is not a GameSR model")
         return model.read_bytes()
     except OSError as error:

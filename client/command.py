@@ -31,7 +31,7 @@ def run_command(program: str, work: Callable[[], int | None], *, debug: bool, in
     1 for a GamesrError, a file that cannot be read or written, or when whoever reads the output has gone; 130 for Ctrl-C and SIGTERM,
     which raise KeyboardInterrupt once: a second one must not stop what the first one made the work clear up.
     """
-    _open_streams()
+    open_streams()
     for signum in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signum, _interrupt)
     try:
@@ -51,14 +51,19 @@ def run_command(program: str, work: Callable[[], int | None], *, debug: bool, in
     except OSError as error:
         if debug:
             traceback.print_exc()
-        _drop_output()  # it may be what could not be written
-        return fail(program, f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        return fail_on_file(program, error)
 
 
 def fail(program: str, sentence: str, status: int = 1) -> int:
     """Say why a command ends with that status."""
     print(f"{program}: {sentence}", file=sys.stderr)
     return status
+
+
+def fail_on_file(program: str, error: OSError) -> int:
+    """Say what could not be read or written; where it has no name it may be stdout."""
+    _drop_output()
+    return fail(program, f"{error.filename}: {error.strerror}" if error.filename else str(error))
 
 
 def reader_gone() -> int:
@@ -75,7 +80,7 @@ def _drop_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _open_streams() -> None:
+def open_streams() -> None:
     """Those that whoever started the program closed are None; what is meant for them goes nowhere, and not into the next file opened."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import FrameType
 
 from client.choice import AUTO, FLOAT_TIERS, INT8_TIERS, chosen_provider, chosen_tiers
-from client.command import command_parser, fail, reader_gone, whole_number
+from client.command import command_parser, fail, fail_on_file, open_streams, reader_gone, whole_number
 from client.errors import GamesrError, how_to_install
 from client.pipeline import Sink
 from client.play_overlay import OverlayLines
@@ -88,6 +88,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
+    open_streams()
     arguments = parser().parse_args(argv)
     if arguments.sink not in ("null", "window") and Path(arguments.sink).suffix.lower() != ".y4m":
         parser().error(f"--sink {arguments.sink} is neither null nor window nor a .y4m file")
@@ -117,8 +118,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         if arguments.debug:
             traceback.print_exc()
-        reader_gone()  # stdout may be what could not be written
-        status = fail(PROGRAM, f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        status = fail_on_file(PROGRAM, error)
     return asked.status or status
 
 

@@ -54,16 +54,6 @@ class Sums:
         return float(by_output.mean())
 
 
-def last_layer_of(network: Network, artifact: Path) -> LastLayer:
-    """Where the network's features end; raises ModelError for one whose last layer is followed by more than the picture."""
-    layer = network.last_layer()
-    if layer is None:
-        raise ModelError(
-            f"{artifact} has more than one layer between its features and its picture: only GameSR networks on planes are refitted"
-        )
-    return layer
-
-
 def sums_of(network: Network, layer: LastLayer, pair: Pair) -> Sums:
     """Play a clip through a float32 network in the form that runs, and take the sums of it; a pure function of its arguments."""
     frames = min(len(pair), FRAMES)
@@ -152,7 +142,12 @@ class Refit:
             raise ModelError(f"{artifact} is {spec.precision}: refit the float32 artifact that it was made from, and quantize that")
         self.artifact, self.spec = artifact, spec
         self.network = network_of_artifact(artifact).float()
-        self.layer = last_layer_of(self.network, artifact)
+        layer = self.network.last_layer()
+        if layer is None:
+            raise ModelError(
+                f"{artifact} has more than one layer between its features and its picture: only GameSR networks on planes are refitted"
+            )
+        self.layer = layer
         self.train: dict[str, Sums] = {}
         self.held_out: dict[str, Sums] = {}
 

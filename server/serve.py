@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 
-from client.command import command_parser, fail, reader_gone
+from client.command import command_parser, fail, fail_on_file, open_streams
 from client.errors import GamesrError, InputError, OutputError, how_to_install
 from server.guards import is_loopback
 from server.runner import RunnerProcess, add_folders
@@ -53,6 +53,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
+    open_streams()
     arguments = parser().parse_args(argv)
     for signum in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signum, _interrupt)
@@ -70,8 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         if arguments.debug:
             traceback.print_exc()
-        reader_gone()  # the address may be what could not be printed
-        return fail(PROGRAM, f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        return fail_on_file(PROGRAM, error)
     return 0
 
 

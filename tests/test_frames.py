@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from client.compare import ComparisonWriter
 from client.errors import OutputError
 from client.frames import Frame, plane_shapes
 from client.quality import squared_error, ssim
@@ -112,8 +113,6 @@ def test_decoded_planes_are_the_decoders_to_write(make_clip: MakeClip) -> None:
 def test_a_picture_that_could_not_be_written_at_the_end_is_refused_at_the_beginning(
     make_clip: MakeClip, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from client.compare import ComparisonWriter
-
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     with VideoSource(make_clip()) as source, pytest.raises(OutputError, match="may not be written to"):
         ComparisonWriter(tmp_path / "c.png", source)
@@ -131,3 +130,10 @@ def test_a_command_outlives_its_streams(ending: str, status: int, tmp_path: Path
     assert result.returncode == status, said
     assert "Traceback" not in said and "Exception ignored" not in said
     assert said.count("\n") == status
+
+
+def test_a_player_whose_stderr_is_closed_says_nothing_on_stdout(tmp_path: Path) -> None:
+    script = "import sys; from client.play_cli import main; sys.exit(main())"
+    command = f"{sys.executable} -c '{script}' {tmp_path / 'missing.mp4'} --sink null 2>&-"
+    result = subprocess.run(["sh", "-c", command], capture_output=True, text=True, timeout=120, check=False)
+    assert (result.returncode, result.stdout) == (1, "")
