@@ -3,7 +3,8 @@
 What that layer adds to the picture is linear in the features, so the squared error of a clip is a quadratic of the layer's weights, and one
 matrix and one vector are all of the clip that has to be known. PSNR is the error's logarithm: a clip weighed by the inverse of its error,
 and the weights solved for again until they stay (iteratively reweighted least squares), comes to rest where the sum of the logarithms,
-which is what `--loss psnr` trains for, has no slope. Training sees crops where detail is; here all of a frame counts, as it does in PSNR.
+which is what `--loss psnr` trains for, has no slope; as there, what is nearer than rounding takes it counts no more. Training sees crops
+where detail is; here all of a frame counts, as it does in PSNR.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from client.errors import InputError, ModelError
 from model.artifact_files import Page, write_artifact
 from model.artifact_weights import network_of_artifact
 from model.footage import Pair, Take
+from model.losses import MSE_FLOOR
 from model.planes import LastLayer, Network, Planes
 from model.train import source_commit
 
@@ -51,7 +53,7 @@ class Sums:
     def after(self, change: Array, outputs: slice) -> float:
         """The mean squared error of some outputs once (F, O) `change` has been added to the weights that make them."""
         by_output = self.squared[outputs] + ((self.features @ change - 2 * self.errors[:, outputs]) * change).sum(0)
-        return float(by_output.mean())
+        return max(0.0, float(by_output.mean()))  # of a clip that comes out right the sum rounds to either side of nothing
 
 
 def sums_of(network: Network, layer: LastLayer, pair: Pair) -> Sums:
@@ -111,7 +113,7 @@ def solved(clips: Iterable[tuple[float, Sums]], outputs: slice) -> Array:
     size = len(sums[0].squared[outputs])
     change = np.zeros((len(sums[0].features), size))
     for _ in range(ROUNDS):
-        weights = [share / clip.after(change, outputs) for share, clip in zip(shares, sums, strict=True)]
+        weights = [share / (clip.after(change, outputs) + MSE_FLOOR) for share, clip in zip(shares, sums, strict=True)]
         matrix = sum(weight * clip.features for weight, clip in zip(weights, sums, strict=True))
         vector = sum(weight * clip.errors[:, outputs] for weight, clip in zip(weights, sums, strict=True))
         change = np.linalg.solve(matrix + RIDGE * np.trace(matrix) / len(matrix) * np.eye(len(matrix)), vector)
@@ -154,17 +156,17 @@ class Refit:
     def solve(self, degradations: Sequence[str]) -> dict[str, list[float]]:
         """Change the network by what `train` says; gives what Y, U and V of each held-out clip gain by it, in dB before rounding.
 
-        `degradations` are those of the clips, named as often as they count. Raises InputError where there is no error to be made less.
+        `degradations` are those of the clips, named as often as they count. Raises InputError where there is no clip.
         """
+        if not self.train:
+            raise InputError("there is nothing to solve for: no training scene has a film of such an input")
         planes = list(self._planes())
-        if not self.train or min(sums.squared[plane].mean() for sums in self.train.values() for plane in planes) == 0:
-            raise InputError("there is nothing to solve for: a clip has no error in some plane, or there is no clip")
         shares = shares_of(list(self.train), degradations)
         changes = [solved(zip(shares, self.train.values(), strict=True), plane) for plane in planes]
         self._add(torch.from_numpy(np.concatenate(changes, 1).T / self.layer.gain).float())
         return {
             title: [
-                float(-10 * np.log10(sums.after(change, plane) / sums.squared[plane].mean()))
+                float(10 * np.log10((sums.squared[plane].mean() + MSE_FLOOR) / (sums.after(change, plane) + MSE_FLOOR)))
                 for change, plane in zip(changes, planes, strict=True)
             ]
             for title, sums in self.held_out.items()
@@ -190,6 +192,7 @@ class Refit:
         for key, weight in self.network.state_dict().items():
             tensor = tensors[f"network.{key}"]
             tensor.CopyFrom(numpy_helper.from_array(weight.numpy().reshape(tuple(tensor.dims)), tensor.name))
+        # Of an earlier one nothing is left: what is solved for does not depend on what the layer was.
         card = {**self.spec.card, "refit": {**facts, "commit": source_commit()}}
         metadata = {entry.key: entry.value for entry in model.metadata_props}
         helper.set_model_props(model, {**metadata, "name": name, "card": json.dumps(card)})
