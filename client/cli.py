@@ -16,7 +16,7 @@ from client.compare import ComparisonWriter
 from client.detail import DetailUpscaler
 from client.errors import InputError, ModelError, OutputError
 from client.models import DEFAULT_MODEL, find_model
-from client.pipe import PIPE, PipedVideo, PipeSink
+from client.pipe import PIPE, PipedVideo, PipeSink, path_or_pipe
 from client.pipeline import Upscaler, upscale_stream
 from client.progress import Progress
 from client.reference import Reference
@@ -27,6 +27,7 @@ from client.summary import Summary
 from client.timing import Stamps
 from client.upscaler import OnnxUpscaler
 from client.video import OpenVideo, VideoSource
+from client.whole_file import landing
 
 PROGRAM = "gamesr-upscale"
 EXAMPLES = """\
@@ -49,9 +50,15 @@ usage, 130 interrupted.
 
 def parser() -> argparse.ArgumentParser:
     parser = command_parser(PROGRAM, "Upscale a game video frame by frame with a small recurrent network.", EXAMPLES)
-    parser.add_argument("input", metavar="INPUT", type=Path, help="the video: H.264 or another codec, 8-bit, progressive; - for a pipe")
     parser.add_argument(
-        "-o", "--output", metavar="OUT", type=Path, help=".mp4 or .mkv, or - for .y4m into a pipe (default: INPUT_gamesr_xSCALE beside it)"
+        "input", metavar="INPUT", type=path_or_pipe, help="the video: H.264 or another codec, 8-bit, progressive; - for a pipe"
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT",
+        type=path_or_pipe,
+        help=".mp4 or .mkv, or - for .y4m into a pipe (default: INPUT_gamesr_xSCALE beside it)",
     )
     parser.add_argument(
         "--model", metavar="NAME|FILE", default=DEFAULT_MODEL, help="a shipped model or an .onnx file (default: %(default)s)"
@@ -199,13 +206,13 @@ def _default_output(path: Path, scale: int) -> Path:
 
 def _check_distinct(output: Path, arguments: argparse.Namespace) -> None:
     """No file may be written that is read, or written twice, whatever --force says."""
-    taken = {path.resolve(): what for path, what in ((arguments.input, "the input"), (arguments.reference, "the reference")) if path}
+    taken = {landing(path): what for path, what in ((arguments.input, "the input"), (arguments.reference, "the reference")) if path}
     for path in (output, arguments.compare):
         if path is None or path == PIPE:
             continue
-        if path.resolve() in taken:
-            raise OutputError(f"cannot write {path}: it is {taken[path.resolve()]}")
-        taken[path.resolve()] = "the output"
+        if landing(path) in taken:
+            raise OutputError(f"cannot write {path}: it is {taken[landing(path)]}")
+        taken[landing(path)] = "the output"
 
 
 def _share(text: str) -> float:

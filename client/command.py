@@ -28,12 +28,11 @@ def command_parser(program: str, description: str, epilog: str) -> argparse.Argu
 def run_command(program: str, work: Callable[[], int | None], *, debug: bool, interrupted: str = "interrupted") -> int:
     """Do a command's work; returns the exit status, and prints `program` and one sentence to stderr where that is not the work's own.
 
-    1 for a GamesrError, a file that cannot be read or written, or when whoever reads the output has gone; 130 for Ctrl-C and SIGTERM,
-    which raise KeyboardInterrupt once: a second one must not stop what the first one made the work clear up.
+    1 for a GamesrError, a file that cannot be read or written, or when whoever reads the output has gone; 130 for Ctrl-C, SIGTERM and
+    SIGHUP, which raise KeyboardInterrupt once: a second one must not stop what the first one made the work clear up.
     """
     open_streams()
-    for signum in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(signum, _interrupt)
+    on_signals(_interrupt)
     try:
         status = work() or 0
         sys.stdout.flush()  # what is lost at the interpreter's end is a traceback of its own
@@ -87,6 +86,15 @@ def open_streams() -> None:
             setattr(sys, name, Path(os.devnull).open(mode))  # noqa: SIM115 - for as long as the program runs
 
 
+def on_signals(handler: Callable[[int, FrameType | None], None] | signal.Handlers) -> None:
+    """What Ctrl-C, SIGTERM and a terminal that closes (SIGHUP) do; under nohup the last goes on doing nothing."""
+    hangup = getattr(signal, "SIGHUP", None)  # not in Windows
+    if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:
+        signal.signal(hangup, handler)
+    for signum in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signum, handler)
+
+
 def whole_number(least: int = 1, most: int = 1_000_000_000) -> Callable[[str], int]:
     """An argument's type: a whole number from `least` to `most`."""
 
@@ -102,8 +110,7 @@ def whole_number(least: int = 1, most: int = 1_000_000_000) -> Callable[[str], i
 
 
 def _interrupt(signum: int, frame: FrameType | None) -> None:
-    for each in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(each, signal.SIG_IGN)
+    on_signals(signal.SIG_IGN)
     raise KeyboardInterrupt
 
 

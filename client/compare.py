@@ -16,7 +16,7 @@ from client.quality import squared_error
 from client.rgb import RgbPicture, to_png, to_rgb
 from client.sink import MUXERS, FileSink
 from client.video import OpenVideo
-from client.whole_file import write_whole
+from client.whole_file import landing, write_whole
 
 AREA_FRACTION = 8
 MAGNIFICATION = 4
@@ -83,10 +83,11 @@ class _WipedVideo:
 
 class _OnePicture:
     def __init__(self, path: Path, labels: tuple[str, str], force: bool) -> None:
-        if not path.parent.is_dir():
-            raise OutputError(f"cannot write {path}: the folder {path.parent} does not exist")
-        if not os.access(path.parent, os.W_OK):  # it is written when all is done: too late to be told
-            raise OutputError(f"cannot write {path}: the folder {path.parent} may not be written to")
+        folder = landing(path).parent
+        if not folder.is_dir():
+            raise OutputError(f"cannot write {path}: the folder {folder} does not exist")
+        if not os.access(folder, os.W_OK):  # it is written when all is done: too late to be told
+            raise OutputError(f"cannot write {path}: the folder {folder} may not be written to")
         if os.path.lexists(path) and not force:
             raise OutputError(f"{path} exists: name another file with --compare, or replace it with --force")
         self._path, self._labels = path, labels

@@ -131,11 +131,11 @@ def live_frames(receiver: RtpReceiver, decoder: LiveDecoder, idle: Callable[[], 
 def _open_decoder() -> VideoCodecContext:
     """One thread: with sliced threads libavcodec conceals lost slices 1 to 5 dB worse, so what is shown would hang on the machine.
 
-    Pictures that the decoder knows to be wrong come out too: they are marked.
+    Pictures that the decoder knows to be wrong come out too: they are marked. Cropping is to the pixel, not to what a processor likes.
     """
     context = av.CodecContext.create("h264", "r")
     assert isinstance(context, VideoCodecContext)
     context.thread_count = 1
-    context.flags |= Flags.low_delay | Flags.output_corrupt
+    context.flags |= Flags.low_delay | Flags.output_corrupt | Flags.unaligned
     context.options = {"max_pixels": str(MAX_PIXELS)}
     return context

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import FrameType
 
 from client.choice import AUTO, FLOAT_TIERS, INT8_TIERS, chosen_provider, chosen_tiers
-from client.command import command_parser, fail, fail_on_file, open_streams, reader_gone, whole_number
+from client.command import command_parser, fail, fail_on_file, on_signals, open_streams, reader_gone, whole_number
 from client.errors import GamesrError, how_to_install
 from client.pipeline import Sink
 from client.play_overlay import OverlayLines
@@ -45,7 +45,7 @@ examples:
       what FFmpeg opens (no losses are known there), resized to the display, into a file
 
 Keys: q or Esc ends, F or F11 fullscreen, F1 the overlay, W the wipe. Exit status: 0 done, 1 refused or failed, 2 wrong usage,
-130 and 143 after Ctrl-C and SIGTERM, with the summary.
+129, 130 and 143 after SIGHUP, Ctrl-C and SIGTERM, with the summary.
 """
 
 
@@ -95,8 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.fullscreen and arguments.sink != "window":
         parser().error("--fullscreen is for --sink window")
     asked = Asked()
-    for signum in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(signum, asked.end)
+    on_signals(asked.end)
     status = 0
     try:
         summary = play(arguments, asked)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import secrets
 from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
@@ -19,6 +18,7 @@ from client.errors import OutputError
 from client.frames import Frame
 from client.pipeline import Sink
 from client.video import from_av_frame, plane_view
+from client.whole_file import landing, partial_beside
 from client.y4m import Y4mWriter
 
 
@@ -65,12 +65,14 @@ class Y4mSink:
     def __init__(self, path: Path, *, force: bool = False) -> None:
         self.path, self.period_ns = path, 1_000_000_000 // 60
         self._force = force
-        if os.path.lexists(path) and (not force or not path.is_file()):
-            reason = "name another file, or replace it with --force" if path.is_file() else "it is not a file"
+        self._target = landing(path)
+        strange = self._target.exists() and not self._target.is_file()
+        if os.path.lexists(path) and (not force or strange):
+            reason = "it is not a file" if strange else "name another file, or replace it with --force"
             raise OutputError(f"cannot write {path}, which exists: {reason}")
-        if not path.parent.is_dir():
-            raise OutputError(f"cannot write {path}: the folder {path.parent} does not exist")
-        self._partial = path.with_name(f".{path.name[:64]}.{secrets.token_hex(4)}.part")
+        if not self._target.parent.is_dir():
+            raise OutputError(f"cannot write {path}: the folder {self._target.parent} does not exist")
+        self._partial = partial_beside(self._target)
         self._file: BinaryIO | None = None
         self._writer: Y4mWriter | None = None
         self._resizer: Resizer | None = None
@@ -85,9 +87,9 @@ class Y4mSink:
                     self._file.seek(0)
                     self._writer.header(self._rate())
                     self._file.close()
-                    if self.path.exists() and not self._force:
+                    if os.path.lexists(self.path) and not self._force:
                         raise OutputError(f"{self.path} has appeared while it was being made: name another file, or use --force")
-                    self._partial.replace(self.path)
+                    self._partial.replace(self._target)
         finally:
             if self._file is not None:
                 with contextlib.suppress(OSError):

@@ -16,6 +16,7 @@ import av
 from av.video.stream import VideoStream
 
 from client.errors import InputError
+from client.pace import step_s
 from client.video import Decoded, OpenVideo, VideoSource
 
 if TYPE_CHECKING:
@@ -182,15 +183,11 @@ class Paced:
 
     def _timed(self) -> Iterator[tuple[int, av.Packet[VideoStream]]]:
         """Each packet with its time from the first one's, which never goes back and never leaps."""
-        period_ns = self._period_ns
-        tick_ns = 1_000_000_000 * Fraction(self._video.time_base)
-        at_ns, last_dts = -period_ns, None
+        period_s = Fraction(self._period_ns, 1_000_000_000)
+        at_ns, last_dts = -self._period_ns, None
         for packet in self._packets:
-            step_ns = period_ns
-            if packet.dts is not None and last_dts is not None:
-                step_ns = int((packet.dts - last_dts) * tick_ns)
-                step_ns = step_ns if 0 <= step_ns <= _BEHIND_NS else period_ns
-            at_ns += step_ns if packet.size else 0
+            if packet.size:
+                at_ns += int(step_s(last_dts, packet.dts, self._video.time_base, period_s) * 1_000_000_000)
             last_dts = packet.dts
             yield max(0, at_ns), packet
 

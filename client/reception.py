@@ -108,12 +108,18 @@ class Reception:
         if is_rtcp(datagram):
             return self._take_rtcp(datagram, address, now_ns)
         packet = parse_rtp(datagram, self._extensions)
-        if packet is None or packet.payload_type != self._payload_type:
+        if packet is None:
             self._counts.ignored += 1
             return []
         number = unwrap(packet.sequence_number, self._newest, 16)
         gone = self.ended and now_ns - self._ended_ns > WAIT_NS
-        if (address, packet.ssrc) == (self.sender, self._ssrc) and not gone and -_MAX_MISORDER < number - self._newest < _MAX_DROPOUT:
+        mine = (address, packet.ssrc) == (self.sender, self._ssrc) and not gone and -_MAX_MISORDER < number - self._newest < _MAX_DROPOUT
+        if packet.payload_type != self._payload_type:
+            if not mine:
+                self._counts.ignored += 1
+                return []
+            packet.payload = b""  # not read, as padding is not, but nor is its number missing: such as of error correction (RFC 5109)
+        if mine:
             return self._accept(number, packet, len(datagram), now_ns)
         return self._consider(packet, len(datagram), address, now_ns)
 

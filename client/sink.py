@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import secrets
+import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,11 +18,14 @@ from client.errors import OutputError
 from client.frames import Frame
 from client.tracks import TrackCopy
 from client.video import OpenVideo, to_av_frame
+from client.whole_file import landing, partial_beside
 
 MUXERS = {".mp4": "mp4", ".mkv": "matroska"}
 # Constant quality far above the stream's own (48 dB from what was computed, on game footage), so that what is seen is the
 # network's work and not a second encoder's.
 X264_OPTIONS = {"preset": "veryfast", "crf": "12"}
+_UNKNOWN = 2  # matrix coefficients of H.273
+_SD_LINES = 576  # up to which players take what is untagged for BT.601, and above for BT.709
 
 
 class NullSink:
@@ -44,12 +47,13 @@ class FileSink:
     """
 
     def __init__(self, path: Path, source: OpenVideo, *, force: bool = False) -> None:
-        self.path = path
+        self.path = path = Path(path)
         self.notes: list[str] = []
         self._source, self._force = source, force
+        self._target = landing(path)
         with _as_sentence(path):
             self._check_target()
-        self._partial = path.with_name(f".{path.name[:64]}.{secrets.token_hex(4)}.part")
+        self._partial = partial_beside(self._target)
         self._encoding: _Encoding | None = None
 
     def __enter__(self) -> Self:
@@ -75,23 +79,23 @@ class FileSink:
             self._encoding.write(frame)
 
     def _check_target(self) -> None:
-        path = self.path
+        path, target = self.path, self._target
         if path.suffix.lower() not in MUXERS:
             raise OutputError(f"cannot write {path}: the name must end in {' or '.join(MUXERS)}")
-        if not path.parent.is_dir():
-            raise OutputError(f"cannot write {path}: the folder {path.parent} does not exist")
-        if path.exists():
-            if self._source.path is not None and path.samefile(self._source.path):
+        if not target.parent.is_dir():
+            raise OutputError(f"cannot write {path}: the folder {target.parent} does not exist")
+        if target.exists():
+            if self._source.path is not None and target.samefile(self._source.path):
                 raise OutputError(f"cannot write {path}: it is the input")
-            if not path.is_file():
+            if not target.is_file():
                 raise OutputError(f"cannot write {path}: it is not a file")
-            if not self._force:
-                raise OutputError(f"{path} exists: name another file, or replace it with --force")
+        if os.path.lexists(path) and not self._force:
+            raise OutputError(f"{path} exists: name another file, or replace it with --force")
 
     def _publish(self) -> None:
-        if not self._force and self.path.exists():
+        if not self._force and os.path.lexists(self.path):
             raise OutputError(f"{self.path} has appeared while it was being made: name another file, or replace it with --force")
-        self._partial.replace(self.path)
+        self._partial.replace(self._target)
 
 
 class _Encoding:
@@ -99,6 +103,7 @@ class _Encoding:
 
     def __init__(self, path: Path, muxer: str, source: OpenVideo, first: Frame) -> None:
         self._source_name = source.name
+        self._untagged = untagged(source, first)
         self._size = (first.width, first.height)
         self._time_base = first.time_base or source.time_base
         self._frame_ticks = max(1, round(1 / (source.frame_rate * self._time_base)))
@@ -139,7 +144,7 @@ class _Encoding:
 
     def notes(self) -> list[str]:
         width, height = self._size
-        notes = []
+        notes = list(self._untagged)
         if width % 2 or height % 2:
             notes.append(
                 f"the {width}x{height} picture is padded to {width + width % 2}x{height + height % 2}: H.264 4:2:0 holds even sizes only"
@@ -167,6 +172,16 @@ class _Encoding:
             pts = 0 if last is None else last + self._frame_ticks
         self._last_pts = pts
         return pts
+
+
+def untagged(source: OpenVideo, first: Frame) -> list[str]:
+    """A note where players would guess other colours for the upscaled picture than for that of the source."""
+    if first.colour.matrix != _UNKNOWN or source.height > _SD_LINES or first.height <= _SD_LINES:
+        return []
+    return [
+        f"the input does not say how its colours are coded, and players guess BT.601 up to {_SD_LINES} lines and BT.709 above, so they may "
+        "show others now: tag it first, H.264 with ffmpeg -c copy -bsf:v h264_metadata=matrix_coefficients=6 (BT.601)"
+    ]
 
 
 def _pad_to_even(frame: Frame) -> Frame:

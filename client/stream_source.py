@@ -16,6 +16,7 @@ from client.access_unit import parameter_sets
 from client.cloud import CloudEncoder, CloudSettings, area_downscale, area_scale
 from client.errors import InputError
 from client.frames import Frame
+from client.pace import step_s
 from client.rtp import CLOCK_HZ
 from client.sender import Unit
 from client.video import VideoSource, open_local
@@ -121,7 +122,7 @@ class EncodedFile:
             begin, again = end + period, loop
 
     def _pictures(self) -> Iterator[tuple[Fraction, Fraction, bytes]]:
-        """Annex B access units with when they are decoded and shown, in seconds from the first one's decoding."""
+        """Annex B access units with when they are decoded and shown, in seconds from the first one's decoding; neither leaps."""
         with open_local(self._path) as container:
             stream = container.streams.best("video")
             if not isinstance(stream, VideoStream) or stream.codec_context is None or stream.codec_context.name != "h264":
@@ -132,16 +133,14 @@ class EncodedFile:
                 raise InputError(f"{self._path} has damaged parameter sets: nothing in it can be decoded") from error
             period = Fraction(1, self._fps) if self._fps else 1 / Fraction(stream.guessed_rate or 30)
             tick = stream.time_base or Fraction(1, CLOCK_HZ)
-            first_dts: int | None = None
-            for index, filtered in enumerate(_filtered(container.demux(stream), annex_b)):
-                decode_at = show_at = index * period
-                if self._fps is None and filtered.dts is not None and filtered.pts is not None:
-                    first_dts = filtered.dts if first_dts is None else first_dts
-                    decode_at = (filtered.dts - first_dts) * tick
-                    show_at = (filtered.pts - first_dts) * tick
-                elif filtered.pts != filtered.dts:
+            decode_at, before = -period, None
+            for filtered in _filtered(container.demux(stream), annex_b):
+                pts, dts = filtered.pts, filtered.dts
+                if self._fps and pts != dts:
                     raise InputError(f"the pictures of {self._path} are not in order (B-frames): leave out --fps")
-                yield decode_at, show_at, bytes(filtered)
+                decode_at += period if self._fps else step_s(before, dts, tick, period)
+                before = dts
+                yield decode_at, decode_at + (0 if pts is None or dts is None else (pts - dts) * tick), bytes(filtered)
 
 
 def _filtered(packets: Iterator[av.Packet[VideoStream]], annex_b: BitStreamFilterContext) -> Iterator[av.Packet[VideoStream]]:

@@ -34,11 +34,12 @@ class TrackCopy:
 
     It reads the file a second time, by itself: whatever drives the video need not know that there is more. Chapters, title, languages and
     which track is the default are kept. A packet of sound whose time does not go on from the one before follows it at once, as pictures do;
-    subtitles that the container of `output` cannot hold are left out; `notes` says so. Raises OutputError for audio that it cannot hold.
+    what FFmpeg does not know, or has not found by then, and subtitles that the container of `output` cannot hold are left out; `notes`
+    says so. Raises OutputError for audio that it cannot hold.
     """
 
     def __init__(self, path: Path, output: OutputContainer) -> None:
-        self._container = open_local(path)
+        self._path, self._container = path, open_local(path)
         self._output = output
         self._targets: dict[int, Stream] = {}
         self._last: dict[int, _Span] = {}  # where each stream's last packet lies
@@ -48,7 +49,8 @@ class TrackCopy:
             self._add_all()
             output.start_encoding()
         except ValueError as error:  # FFmpeg's "Invalid argument" is one too
-            names = ", ".join(stream.name or "unknown" for stream in self._container.streams.audio)
+            tried = (stream for stream in self._container.streams.audio if stream.codec_context is not None)
+            names = ", ".join(stream.name or "unknown" for stream in tried)
             self._container.close()
             if not names:
                 raise
@@ -68,7 +70,7 @@ class TrackCopy:
         self._container.close()
 
     def notes(self) -> list[str]:
-        notes = [f"{text} is left out: {self._output.format.name} cannot hold it" for text in self._left_out]
+        notes = list(self._left_out)
         if self._moved:
             notes.append(f"{self._moved} packets of sound had a timestamp that went back: each follows the one before")
         return notes
@@ -78,16 +80,32 @@ class TrackCopy:
         said = self._container.metadata
         self._output.metadata.update({name: text for name, text in said.items() if name.lower() not in _OF_THE_CONTAINER})
         self._output.set_chapters(self._container.chapters())
-        for stream in self._container.streams.audio:
+        for number, stream in enumerate(self._container.streams.audio, 1):
+            if not self._known(stream, f"audio track {number}"):
+                continue
+            if not stream.codec_context.sample_rate or not stream.codec_context.channels:
+                longer = f"ffmpeg -probesize 1G -analyzeduration 1G -i {self._path} -c copy FILE.mkv"
+                self._left_out.append(
+                    f"audio track {number} ({stream.name}) is left out: none was found; if it begins late, upscale what {longer} makes"
+                )
+                continue
             self._targets[stream.index] = target = _described(self._output.add_stream_from_template(stream), stream)
             channels = stream.codec_context.channels
             if stream.codec_context.layout.name == f"{channels} channels":  # of .avi and .mkv, which do not say which is which
                 target.codec_context.layout = f"{channels}c"  # FFmpeg's word for the usual ones
         for number, subtitles in enumerate(self._container.streams.subtitles, 1):
+            if not self._known(subtitles, f"subtitle track {number}"):
+                continue
             try:
                 self._targets[subtitles.index] = _described(self._output.add_stream_from_template(subtitles), subtitles)
             except ValueError:
-                self._left_out.append(f"subtitle track {number} ({subtitles.name or 'unknown'})")
+                container = self._output.format.name
+                self._left_out.append(f"subtitle track {number} ({subtitles.name or 'unknown'}) is left out: {container} cannot hold it")
+
+    def _known(self, stream: Stream, what: str) -> bool:
+        if stream.codec_context is None:
+            self._left_out.append(f"{what} is left out: its codec is not known here")
+        return stream.codec_context is not None
 
     def _read(self) -> Iterator[av.Packet[Any]]:
         if not self._targets:

@@ -16,6 +16,7 @@ import numpy as np
 from av.buffer import Buffer
 from av.codec.context import Flags, ThreadType
 from av.container import InputContainer
+from av.stream import Disposition
 from av.video.plane import VideoPlane
 from av.video.stream import VideoStream
 
@@ -43,9 +44,9 @@ class Decoded:
 class OpenVideo:
     """The video stream of a container that is open; a context manager, iterated once for its frames in order of presentation.
 
-    Frames come out as 8-bit 4:2:0 (see `from_av_frame`), sliced threads and low_delay: nothing waits for a later packet
-    unless the stream reorders. A packet that cannot be decoded is counted in `decode_errors` and decoding goes on; from
-    there to the next key frame the frames are marked damaged. `announced_frames` is what the container says it holds, and
+    Frames come out as 8-bit 4:2:0 (see `from_av_frame`), with sliced threads: nothing waits for a later packet unless the
+    stream reorders. A packet that cannot be decoded is counted in `decode_errors` and decoding goes on; from there to the next
+    key frame behind it the frames are marked damaged. `announced_frames` is what the container says it shows, and
     `estimated_frames` that or its duration times its frame rate; None where it says neither.
 
     Once it is closed, asking for more raises ValueError; frames that came out before stay valid.
@@ -69,16 +70,21 @@ class OpenVideo:
             raise
         context = self._stream.codec_context
         context.thread_type = ThreadType.SLICE
-        context.flags |= Flags.low_delay
+        # Cropped to the pixel, where FFmpeg would keep columns on the left that are not to be seen; and each picture names its packet.
+        context.flags |= Flags.unaligned | Flags.copy_opaque
+        if context.name == "libdav1d":  # or pictures wait; the decoders of MPEG-1, 2 and 4 take this flag for a promise of no B-frames
+            context.flags |= Flags.low_delay
         context.options = {"max_pixels": str(MAX_SIDE * MAX_SIDE)}
         self.width, self.height = context.width, context.height
         self.time_base = self._stream.time_base or Fraction(1, 90000)
         self.frame_rate = self._stream.guessed_rate or self._stream.average_rate or Fraction(30)
         self.sample_aspect_ratio = self._stream.sample_aspect_ratio or Fraction(1)
-        self.announced_frames = self._stream.frames or None
+        self.announced_frames = self._announced() or None
+        self.has_sound = bool(container.streams.audio)
         duration_us = self._container.duration
         self.estimated_frames = self.announced_frames or (round(duration_us * self.frame_rate / 1_000_000) if duration_us else None)
         self._damaged = False
+        self._given = self._lost_at = 0  # packets so far, and when one was lost
         self._begun = False
         self._closed = False
 
@@ -97,11 +103,13 @@ class OpenVideo:
         """The frames that one of `packets` completes."""
         self._check_open()
         packet_ns = time.perf_counter_ns()
+        self._given += 1
+        packet.opaque = (self._given,)  # a new object each time: PyAV tells them apart by their addresses
         try:
             pictures = packet.decode()
         except av.FFmpegError:
             self.decode_errors += 1
-            self._damaged = True
+            self.distrust()
             return
         for picture in pictures:
             self._check_open()
@@ -110,8 +118,8 @@ class OpenVideo:
             packet_ns = time.perf_counter_ns()  # a second frame of the same packet did not wait while the first was used
 
     def distrust(self) -> None:
-        """A packet was thrown away: what comes is damaged until the next key frame."""
-        self._damaged = True
+        """A packet was lost: what comes is damaged until a key frame of a later packet; an earlier one may yet wait to be reordered."""
+        self._damaged, self._lost_at = True, self._given
 
     def packets(self) -> Iterator[av.Packet[VideoStream]]:
         """Packets with something in them, then one empty one: it flushes the decoder, and any other would end it early."""
@@ -143,17 +151,27 @@ class OpenVideo:
         if not self._begun:  # of later ones too it would make a cycle of references, which keeps pictures until a garbage collection
             self._begun = True
             self.display_matrix = _display_matrix(picture)
+        packet = cast("tuple[int] | None", picture.opaque)
         if picture.is_corrupt:
             self._damaged = True
-        elif picture.key_frame:
+        elif picture.key_frame and (packet is None or packet[0] > self._lost_at):
             self._damaged = False
         return from_av_frame(picture, damaged=self._damaged)
+
+    def _announced(self) -> int:
+        """Frames by the container's count; of an .mp4 or .mov those that its edit list leaves, which the count does not know of."""
+        counted = self._stream.frames
+        if not counted or "mp4" not in self._container.format.name:
+            return counted
+        return sum(not entry.is_discard for entry in self._stream.index_entries)
 
     def _video_stream(self) -> VideoStream:
         stream = self._container.streams.best("video")  # not a cover picture where there is a video
         if not isinstance(stream, VideoStream):
             kinds = ", ".join(sorted({stream.type for stream in self._container.streams})) or "no stream"
             raise InputError(f"{self.name} has no video stream ({kinds} only)")
+        if stream.disposition & Disposition.attached_pic:
+            raise InputError(f"{self.name} has no video stream but a cover picture")
         if stream.codec_context is None:
             raise InputError(f"{self.name} has a video stream of a codec that cannot be decoded")
         context = stream.codec_context

@@ -187,8 +187,8 @@ def window(no_screen: None) -> Iterator[Window]:
 
 @pytest.fixture(autouse=True)
 def own_signal_handlers() -> Iterator[None]:
-    """The command line takes over two signals, as a process of its own may."""
-    handlers = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
+    """The command line takes over three signals, as a process of its own may."""
+    handlers = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     yield
     for signum, handler in handlers.items():
         signal.signal(signum, handler)

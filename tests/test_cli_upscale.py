@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from client import cli
+from client.command import run_command
 from client.frames import Frame
 from client.models import find_model
 from client.progress import Progress
@@ -234,7 +235,7 @@ def test_examples_in_the_help_parse() -> None:
         assert cli.parser().parse_args(example[1:]).input == Path(example[1])
 
 
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupt_in_the_middle_leaves_no_file(
     make_clip: MakeClip,
     tiny: str,
@@ -243,6 +244,7 @@ def test_an_interrupt_in_the_middle_leaves_no_file(
     monkeypatch: pytest.MonkeyPatch,
     signum: signal.Signals,
 ) -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # also where the tests run under nohup
     clip = make_clip()
     before = sorted(tmp_path.iterdir())
     step, pts = OnnxUpscaler.step, []
@@ -258,7 +260,13 @@ def test_an_interrupt_in_the_middle_leaves_no_file(
     assert cli.main([str(clip), "--model", tiny]) == 130
     assert capsys.readouterr().err == "gamesr-upscale: interrupted, nothing was written\n"
     assert sorted(tmp_path.iterdir()) == before
-    assert signal.getsignal(signal.SIGINT) == signal.getsignal(signal.SIGTERM) == signal.SIG_IGN  # no second one stops the removal
+    # No second one stops the removal.
+    assert {signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)} == {signal.SIG_IGN}
+
+
+def test_under_nohup_a_terminal_may_close() -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    assert run_command("gamesr", lambda: os.kill(os.getpid(), signal.SIGHUP), debug=False) == 0
 
 
 def test_a_reader_that_leaves_is_no_crash(make_clip: MakeClip, tiny: str) -> None:

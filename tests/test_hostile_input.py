@@ -13,6 +13,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from av.stream import Disposition
 
 from client import cli
 from client.video import read_frames
@@ -87,6 +88,17 @@ def test_audio_only(refused: Callable[..., str], tmp_path: Path) -> None:
         container.mux(sound.encode(block))
         container.mux(sound.encode(None))
     assert refused(tmp_path / "sound.mp4").endswith("sound.mp4 has no video stream (audio only)")
+
+
+def test_a_cover_picture_is_no_film(refused: Callable[..., str], make_clip: MakeClip, tmp_path: Path) -> None:
+    picture, song = make_clip("cover.mp4", codec="mjpeg", pix_fmt="yuvj420p", frames=1, options={}), tmp_path / "song.mp4"
+    with av.open(str(picture)) as cover, av.open(str(song), "w") as out:
+        target = out.add_stream_from_template(cover.streams.video[0])
+        target.disposition = Disposition.attached_pic
+        packet = next(cover.demux(video=0))
+        packet.stream = target
+        out.mux(packet)
+    assert refused(song).endswith("song.mp4 has no video stream but a cover picture")
 
 
 def test_zero_frames(refused: Callable[..., str], make_clip: MakeClip, tmp_path: Path) -> None:
@@ -222,6 +234,12 @@ def test_colour_is_never_silently_changed(
     assert (before.colour.range, before.colour.matrix) == (tags[0], tags[3])
     for low, high in ((before.u, after.u), (before.v, after.v)):
         assert abs(float(low.mean()) - float(high.mean())) < 0.5
+
+
+@pytest.mark.parametrize(("height", "matrix", "said"), [(540, 2, True), (540, 6, False), (640, 2, False), (48, 2, False)])
+def test_that_players_may_guess_other_colours_is_said(saved: Run, make_clip: MakeClip, height: int, matrix: int, said: bool) -> None:
+    notes = saved(make_clip(width=16, height=height, frames=2, tags=(0, 2, 2, matrix)))["notes"]
+    assert ("guess BT.601 up to 576 lines and BT.709 above" in str(notes)) == said
 
 
 def test_output_folder_missing_or_wrong_name(refused: Callable[..., str], make_clip: MakeClip, tmp_path: Path) -> None:

@@ -161,12 +161,13 @@ def test_tiers_that_do_not_ship_are_an_error(play: Play, make_clip: MakeClip) ->
     assert status == 1 and "no model named 'warp' ships for scale 2" in errors and len(errors.splitlines()) == 1
 
 
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_with_the_summary(make_clip: MakeClip, model_file: Callable[..., Path], tmp_path: Path, signum: int) -> None:
     """Also the file is whole: all that was shown is in it."""
     out = tmp_path / "out.y4m"
     arguments = [str(make_clip(frames=900)), "--model", str(model_file()), "--sink", str(out), "--json", "--threads", "1"]
-    program = [sys.executable, "-c", "import sys; from client.play_cli import main; sys.exit(main())", *arguments]
+    ours = "import signal, sys; signal.signal(signal.SIGHUP, signal.SIG_DFL); from client.play_cli import main; sys.exit(main())"
+    program = [sys.executable, "-c", ours, *arguments]
     environment = os.environ | {"PYTHONPATH": str(Path.cwd())}
     with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as process:
         try:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from aiortc.rtp import RtpPacket
 
 from client import stream_cli
 from client.access_unit import AccessUnit
@@ -73,6 +74,24 @@ def test_a_file_arrives_as_it_is(make_clip: MakeClip, receiver: RtpReceiver, opt
     assert [b - a for a, b in itertools.pairwise(pts)] == [3000] * (len(got) - 1)
     for item in got:
         assert item.unit.sent_ns is not None and item.unit.sent_ns - 20_000 <= item.unit.first_ns <= item.unit.last_ns <= item.packet_ns
+
+
+def test_packets_of_another_payload_type_in_the_stream_are_not_missed() -> None:
+    """Such as error correction: of the same SSRC, numbered along. They bring nothing, and none is lost; those of others are ignored."""
+    ours, reception, units = RtpStream(), Reception(wall_offset_ns=0), []
+    for number in range(30):
+        datagrams = list(ours.datagrams(Unit(unit(number, 5 if number == 0 else 1), number * 1500), lambda: 0))
+        repair = RtpPacket.parse(datagrams[-1])
+        repair.payload_type, repair.sequence_number = 127, ours._sequence
+        ours._sequence = (ours._sequence + 1) & 0xFFFF
+        foreign = RtpPacket(127, 1, number, 0, ours.ssrc ^ 1, b"sound")
+        for datagram in (*datagrams, repair.serialize(), foreign.serialize()):
+            units += reception.take(datagram, ("127.0.0.1", 5000), number * 16_000_000)
+    units += reception.release(10**10)
+    assert [whole.data for whole in units] == [unit(number, 5 if number == 0 else 1) for number in range(30)]
+    assert not any(whole.damaged for whole in units) and reception.feedback(10**10) is None
+    counts = reception.counts
+    assert (counts.lost, counts.ignored, counts.senders, counts.malformed) == (0, 30, 1, 0)
 
 
 def test_a_request_over_sockets_brings_an_idr(make_clip: MakeClip, receiver: RtpReceiver, model_file: Callable[..., Path]) -> None:

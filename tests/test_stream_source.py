@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import av
@@ -11,8 +12,10 @@ import pytest
 
 from client import stream_cli
 from client.errors import InputError
+from client.rtp import CLOCK_HZ
 from client.sdp import LOOPBACK
 from client.stream_source import EncodedFile
+from tests.conftest import FRAMES
 
 MakeClip = Callable[..., Path]
 BYE = bytes([0x81, 203, 0, 1])  # RTCP, of one source
@@ -52,6 +55,32 @@ def test_a_file_that_cannot_be_read_further_is_sent_up_to_there(make_clip: MakeC
         while said[-8:-4] != BYE:
             said = receiver.recv(2048)
     assert capsys.readouterr().out.startswith("7 pictures ")
+
+
+@pytest.mark.parametrize("options", [None, {"bf": "2", "b-adapt": "0", "g": "6"}], ids=["in-order", "b-frames"])
+def test_where_timestamps_go_back_the_stream_goes_on(make_clip: MakeClip, options: dict[str, str] | None) -> None:
+    """As between two recordings in one file. Each picture is shown as long after its decoding as the file says."""
+    clip = make_clip("clip.ts", options=options)
+    once = times(EncodedFile(clip))
+    clip.write_bytes(2 * clip.read_bytes())
+    twice = times(EncodedFile(clip))
+    assert len(twice) == 2 * FRAMES and [delay for _, delay in twice] == 2 * [delay for _, delay in once]
+    assert all(0.033 <= after - before <= 0.034 for (before, _), (after, _) in pairwise(twice))
+
+
+def test_where_timestamps_leap_the_stream_does_not_wait(make_clip: MakeClip) -> None:
+    """More than a second is a leap; less is as it is."""
+    clip = make_clip("clip.ts", pts=[0, 1, 2, 20, 21, 22, 90_000, 90_001, 90_002, 90_003, 90_032, 90_070])
+    due = [at for at, _ in times(EncodedFile(clip))]
+    assert [round(30 * (after - before)) for before, after in pairwise(due)] == [1, 1, 18, 1, 1, 1, 1, 1, 1, 29, 1]
+
+
+def times(source: EncodedFile) -> list[tuple[float, int]]:
+    """When each unit is due, in seconds, and how many ticks later its picture is shown."""
+    found = []
+    while (due_ns := source.due_ns()) is not None:
+        found.append((due_ns / 1e9, round(source.take(idr=False).timestamp - due_ns * CLOCK_HZ / 1e9)))
+    return found
 
 
 def test_parameter_sets_that_are_none_are_one_sentence(make_clip: MakeClip) -> None:

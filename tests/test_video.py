@@ -75,6 +75,21 @@ def test_stamps_are_in_order(make_clip: MakeClip) -> None:
     assert stamps == sorted(stamps) and len(stamps) == 2 * FRAMES
 
 
+def test_what_an_edit_list_cuts_off_is_not_announced(make_clip: MakeClip) -> None:
+    """Pictures behind the last key frame before the cut are decoded and not shown, those before it not read at all."""
+    path = make_clip(options={"g": "6", "bf": "2"})
+    with av.open(str(path)) as container:
+        ticks = round(1 / (30 * container.streams.video[0].time_base))
+    content = bytearray(path.read_bytes())
+    begin = content.index(b"elst") + 16  # of the only edit, in the track's own time
+    shown = int.from_bytes(content[begin : begin + 4], "big")
+    for cut in (2, 8):
+        content[begin : begin + 4] = (shown + cut * ticks).to_bytes(4, "big")
+        path.write_bytes(content)
+        with VideoSource(path) as source:
+            assert source.announced_frames == source.estimated_frames == len(list(source)) == FRAMES - cut
+
+
 @pytest.mark.parametrize("tags", [(1, 1, 1, 1), (2, 1, 1, 1), (1, 5, 6, 5), (1, 6, 6, 6), (0, 2, 2, 2)])
 def test_colour_tags_go_through(make_clip: MakeClip, tags: tuple[int, int, int, int]) -> None:
     frame = next(read_frames(make_clip(tags=tags)))
