@@ -4,7 +4,8 @@ What that layer adds to the picture is linear in the features, so the squared er
 matrix and one vector are all of the clip that has to be known. PSNR is the error's logarithm: a clip weighed by the inverse of its error,
 and the weights solved for again until they stay (iteratively reweighted least squares), comes to rest where the sum of the logarithms,
 which is what `--loss psnr` trains for, has no slope; as there, what is nearer than rounding takes it counts no more. Training sees crops
-where detail is; here all of a frame counts, as it does in PSNR.
+where detail is; here all of a frame counts, as it does in PSNR. What the layer reads may come in 8 bits, of an int8 artifact or of
+bfloat16: weights that live on differences of features would be lost there, so it is solved for features that are off by as much.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ FRAMES = 24  # of each clip, over which a state is carried
 EVERY = 6  # of which one in so many is looked at
 SHARE = 1 / 9  # of its cells, others in every frame of every clip: what lies in the same place in all of a game, as its HUD, is no sample
 ROUNDS = 12  # more change nothing that a float32 holds
+STEPS = 255  # from the lowest to the highest value of a channel, in an int8 artifact
 RIDGE = 1e-7  # of the mean square of a feature: for features that are never anything but zero
 
 Array = NDArray[np.float64]
@@ -44,16 +46,26 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sums:
-    """Of one clip: means over cells of features by features (F, F), features by errors (F, O) and squared errors (O,), in codes squared."""
+    """Of one clip: means over cells of features by features (F, F), features by errors (F, O) and squared errors (O,), in codes squared.
+
+    `reach` is the distance from the lowest to the highest value of what gave each feature (F,); 0 of the one that stands for the biases.
+    """
 
     features: Array
     errors: Array
     squared: Array
+    reach: Array
 
     def after(self, change: Array, outputs: slice) -> float:
         """The mean squared error of some outputs once (F, O) `change` has been added to the weights that make them."""
         by_output = self.squared[outputs] + ((self.features @ change - 2 * self.errors[:, outputs]) * change).sum(0)
         return max(0.0, float(by_output.mean()))  # of a clip that comes out right the sum rounds to either side of nothing
+
+    def rounded(self, reach: Array, weights: Array) -> Sums:
+        """The same of features that are rounded to STEPS of `reach`, for a layer whose weights are (F, O) `weights`."""
+        noise = (reach / STEPS) ** 2 / 12
+        lost = noise[:, None] * weights
+        return Sums(self.features + np.diag(noise), self.errors - lost, self.squared + (lost * weights).sum(0), reach)
 
 
 def sums_of(network: Network, layer: LastLayer, pair: Pair) -> Sums:
@@ -62,6 +74,7 @@ def sums_of(network: Network, layer: LastLayer, pair: Pair) -> Sums:
     features: list[Tensor] = []
     hook = layer.module.register_forward_pre_hook(lambda module, inputs: features.append(inputs[0][:, : layer.features]))
     sums: list[Any] = [0, 0, 0]
+    reach: list[Tensor] = []
     looked_at = range(min(2, frames - 1), frames, EVERY)
     places = np.random.default_rng(list(pair.title.encode()))
     try:
@@ -77,9 +90,13 @@ def sums_of(network: Network, layer: LastLayer, pair: Pair) -> Sums:
                     )
                     new = _sums(features[0], wanted - torch.cat(cells, 1), layer.padding, places)
                     sums = [old + part / len(looked_at) for old, part in zip(sums, new, strict=True)]
+                    reach.append(torch.stack(torch.aminmax(features[0].flatten(2), dim=2)))
     finally:
         hook.remove()
-    return Sums(*(np.asarray(part) for part in sums))
+    lowest, highest = torch.stack(reach)[:, :, 0].unbind(1)
+    of_channels = (highest.amax(0) - lowest.amin(0)).double().numpy()
+    by_features, by_errors, squared = map(np.asarray, sums)
+    return Sums(by_features, by_errors, squared, np.append(np.repeat(of_channels, 9), 0))
 
 
 def _kept_in(cells: list[Tensor]) -> Callable[[Tensor], Tensor]:
@@ -162,7 +179,9 @@ class Refit:
             raise InputError("there is nothing to solve for: no training scene has a film of such an input")
         planes = list(self._planes())
         shares = shares_of(list(self.train), degradations)
-        changes = [solved(zip(shares, self.train.values(), strict=True), plane) for plane in planes]
+        reach = np.max([sums.reach for sums in self.train.values()], 0)
+        train = [sums.rounded(reach, self._weights()) for sums in self.train.values()]
+        changes = [solved(zip(shares, train, strict=True), plane) for plane in planes]
         self._add(torch.from_numpy(np.concatenate(changes, 1).T / self.layer.gain).float())
         return {
             title: [
@@ -177,6 +196,13 @@ class Refit:
         for side in self.layer.sides:
             yield slice(first, first + side**2)
             first += side**2
+
+    @torch.no_grad()
+    def _weights(self) -> Array:
+        """Of the layer as it is (F, O), in codes; the biases last."""
+        weights = [weight[:, : self.layer.features].flatten(1) for weight in self.layer.weights]
+        whole = torch.cat((torch.cat(weights), torch.cat(list(self.layer.biases))[:, None]), 1)
+        return (self.layer.gain * whole.double()).numpy().T
 
     @torch.no_grad()
     def _add(self, change: Tensor) -> None:

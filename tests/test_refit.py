@@ -36,7 +36,7 @@ CARD = {
 def made_clip(rng: np.random.Generator, level: float) -> tuple[np.ndarray, np.ndarray, Sums]:
     x = rng.normal(size=(400, 6))
     e = level * (x @ rng.normal(size=(6, 5)) + rng.normal(size=(400, 5)))
-    return x, e, Sums(x.T @ x / 400, x.T @ e / 400, (e**2).mean(0))
+    return x, e, Sums(x.T @ x / 400, x.T @ e / 400, (e**2).mean(0), np.ptp(x, 0))
 
 
 def test_of_one_clip_it_is_least_squares() -> None:
@@ -71,10 +71,27 @@ def test_a_clip_that_is_right_already_does_not_take_all_the_weight(level: float)
     alone = textured.after(solved([(1, textured)], outputs), outputs)
     x = np.repeat(rng.normal(size=(1, 6)), 400, 0)
     e = level * rng.normal(size=(400, 5))
-    right = Sums(x.T @ x / 400, x.T @ e / 400, (e**2).mean(0))
+    right = Sums(x.T @ x / 400, x.T @ e / 400, (e**2).mean(0), np.zeros(6))
     change = solved([(0.5, textured), (0.5, right)], outputs)
     assert textured.after(change, outputs) < textured.squared.mean() / 2 and alone < textured.squared.mean() / 4
     assert right.after(change, outputs) < 1 / 12  # what rounding to codes takes
+
+
+def test_what_is_solved_for_rounded_features_is_the_least_error_with_them_rounded() -> None:
+    rng = np.random.default_rng(4)
+    x, e, _ = made_clip(rng, 1)
+    x[:, 1] = x[:, 0] + 1e-3 * rng.normal(size=400)  # a difference that no rounding leaves
+    weights, reach = rng.normal(size=(6, 5)), np.array([80.0, 80, 9, 3, 1, 0])
+    exact = Sums(x.T @ x / 400, x.T @ e / 400, (e**2).mean(0), reach)
+    noise = rng.uniform(-0.5, 0.5, (200, 400, 6)) * reach / 255
+
+    def error(change: np.ndarray) -> float:
+        return float(np.square(e - x @ change - noise @ (weights + change)).mean())
+
+    robust, brittle = solved([(1, exact.rounded(reach, weights))], slice(0, 5)), solved([(1, exact)], slice(0, 5))
+    assert error(robust) < error(brittle) and error(robust) == pytest.approx(
+        exact.rounded(reach, weights).after(robust, slice(0, 5)), rel=0.01
+    )
 
 
 def test_games_and_scenes_count_alike_and_inputs_as_often_as_named() -> None:
@@ -124,9 +141,9 @@ def test_the_new_artifact_has_the_errors_that_were_solved_for(
     shares = shares_of(list(errors), HOW)
     gained = []
     for plane in new._planes():
-        change = solved(
-            [(share, errors[pair.title][0]) for share, pair in zip(shares, pairs, strict=True) if "four" not in pair.title], plane
-        )
+        train = [(share, errors[pair.title][0]) for share, pair in zip(shares, pairs, strict=True) if "four" not in pair.title]
+        reach = np.max([sums.reach for _, sums in train], 0)
+        change = solved([(share, sums.rounded(reach, old._weights())) for share, sums in train], plane)
         for sums, better in errors.values():
             assert better.squared[plane].mean() == pytest.approx(sums.after(change, plane), rel=2e-3, abs=1e-6)
             gained.append(10 * np.log10(sums.squared[plane].mean() / better.squared[plane].mean()))
