@@ -1,7 +1,7 @@
 """The service: what a sweep's store holds, over HTTP, and sweeps that are started over HTTP.
 
 Everything is JSON (`server.schemas`, `server.requests`), everything of a status from 400 on is `Problem`, and /api/v1/openapi.json
-describes all of it. What changes something takes the header X-API-Key where a key is configured.
+describes all of it. What changes something takes the header X-API-Key where a key is configured. HEAD is answered wherever GET is.
 
     GET    /                                             the page; /static/ is its files
     GET    /health  /ready                               Health; 503 when not ready
@@ -29,6 +29,7 @@ describes all of it. What changes something takes the header X-API-Key where a k
     GET    /api/v1/frames/{clip}/{frame}?picture=reference
     GET    /api/v1/frames/{clip}/{frame}?picture=NAME&low_height=270&bitrate_kbps=1000
                                                          image/png; 202 while it is computed (ask again after Retry-After),
+                                                         304 for the ETag of If-None-Match,
                                                          404 no such clip or frame, 422 unfit, 429 too many at once
 
 A picture is `reference`, `none` (native: the clip itself, encoded; `low_height` is then the clip's) or the name of a model. A clip
@@ -43,13 +44,15 @@ from pathlib import Path
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import FileResponse, JSONResponse
+from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.staticfiles import StaticFiles
+from starlette.types import Scope
 
 from client.errors import GamesrError
 from server.cards import artifacts
 from server.guards import Guards
+from server.methods import Heads, allowed
 from server.monitoring import Watched
 from server.routes import clips, frames, health, models, players, results, sweeps
 from server.service import Service
@@ -75,7 +78,8 @@ def create_app(settings: Settings) -> FastAPI:
         redoc_url=None,
     )
     app.state.service = service
-    app.add_middleware(Guards, limits=settings.limits, loopback=settings.loopback)
+    app.add_middleware(Heads)
+    app.add_middleware(Guards, limits=settings.limits, loopback=settings.loopback, public_name=settings.public_name)
     app.add_middleware(Watched, monitoring=service.monitoring)
     app.add_exception_handler(HTTPException, _refused)
     app.add_exception_handler(RequestValidationError, _unfit)
@@ -84,19 +88,31 @@ def create_app(settings: Settings) -> FastAPI:
     app.include_router(health.router)
     for subject in (sweeps, results, clips, frames, models, players):
         app.include_router(subject.router, prefix=PREFIX)
-    app.add_api_route("/", _page, methods=["GET", "HEAD"], include_in_schema=False)
-    app.mount("/static", StaticFiles(directory=PAGE, check_dir=False))
+    files = _PageFiles(directory=PAGE, check_dir=False)
+
+    @app.get("/", include_in_schema=False)
+    async def page(request: Request) -> Response:
+        return await files.get_response("index.html", request.scope)
+
+    app.mount("/static", files)
     app.openapi()  # written once, and not while requests wait
     return app
 
 
-def _page() -> FileResponse:
-    return FileResponse(PAGE / "index.html", headers={"Cache-Control": "no-cache"})
+class _PageFiles(StaticFiles):
+    """A browser keeps them, and asks whether they are still the same."""
+
+    async def get_response(self, path: str, scope: Scope) -> Response:
+        response = await super().get_response(path, scope)
+        response.headers["Cache-Control"] = "no-cache"
+        return response
 
 
 async def _refused(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
-    return JSONResponse({"detail": str(error.detail)}, error.status_code, error.headers)
+    methods = allowed(request.app, request.scope) if error.status_code == 405 else ""
+    headers = {"Allow": methods} if methods else error.headers
+    return JSONResponse({"detail": str(error.detail)}, error.status_code, headers)
 
 
 async def _unfit(request: Request, error: Exception) -> JSONResponse:

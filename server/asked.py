@@ -56,8 +56,8 @@ class AskedSweep:
 
     @property
     def key(self) -> str:
-        """The sha256 of all keys: the same question is the same sweep, whoever asks it."""
-        content = [sorted(point.key for point in self.points), sorted(self.latencies)]
+        """The sha256 of all keys and names: the same question under the same names is the same sweep, whoever asks it."""
+        content = [sorted((point.key, point.clip, point.upscaler) for point in self.points), sorted(self.latencies)]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
     def record(self) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from server.events import (
     event_record,
 )
 from server.export import points_csv, sweep_json
+from server.names import shown
 from server.plan import Plan, Request, make_plan
 from server.points import LatencyResult, PointResult
 from server.progress import SweepProgress
@@ -38,6 +39,7 @@ from server.sweep import run_sweep
 from server.workers import LocalWorkers, Workers
 
 PROGRAM = "gamesr-sweep"
+SWEEP_JSON = "sweep.json"
 EXAMPLES = """\
 examples:
   gamesr-sweep match_1080p.mp4 --out report
@@ -54,7 +56,8 @@ what is measured:
   bitrate, counted from packets. When all points are there, latency is measured on the stream of the middle bitrate, with
   nothing else of the sweep running.
 
-Results are kept in the store: the same command goes on where it was stopped, and another one reuses what it shares.
+Results are kept in the store: the same command goes on where it was stopped, also where something failed and its report says
+so, and another one reuses what it shares.
 Exit status: 0 done, 1 refused or something failed (one sentence says why; what was finished stays), 2 wrong usage,
 130 interrupted.
 """
@@ -117,7 +120,7 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     arguments = parser().parse_args(argv)
-    command = shlex.join([PROGRAM, *(sys.argv[1:] if argv is None else argv)])
+    command = shown(shlex.join([PROGRAM, *(sys.argv[1:] if argv is None else argv)]))
 
     def work() -> None:
         failures = sweep(arguments, command)
@@ -132,7 +135,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def sweep(arguments: argparse.Namespace, command: str) -> list[PointFailed | LatencyFailed]:
     """Everything between the arguments and what is printed and written; returns what failed. Raises GamesrError."""
-    _prepare(arguments.out, arguments.force)
+    _prepare(arguments.out, command, arguments.force)
     request = Request(
         clips=arguments.clips,
         bitrates_kbps=arguments.bitrates,
@@ -159,7 +162,7 @@ def sweep(arguments: argparse.Namespace, command: str) -> list[PointFailed | Lat
     if arguments.out and found.points:
         _write(arguments.out, found, command)
         if not arguments.json:
-            print(f"the report, with savings and BD-rates: {arguments.out / 'report.html'}", flush=True)
+            print(f"the report, with savings and BD-rates: {shown(str(arguments.out / 'report.html'))}", flush=True)
     return found.failures
 
 
@@ -188,8 +191,10 @@ class _Found:
         return sorted(self._points, key=lambda result: self._order[result.point.key])
 
 
-def _prepare(out: Path | None, force: bool) -> None:
-    """All is there that writing needs, and the folder empty or given up, before hours of work go into what is to be written."""
+def _prepare(out: Path | None, command: str, force: bool) -> None:
+    """All is there that writing needs, before hours of work go into what is to be written: the folder too, which is empty, given up, or
+    holds a report of the same command that is not whole.
+    """
     if out is None:
         return
     missing = [name for name in ("bjontegaard", "matplotlib") if find_spec(name) is None]
@@ -198,8 +203,17 @@ def _prepare(out: Path | None, force: bool) -> None:
     there = next(folder for folder in (out.absolute(), *out.absolute().parents) if os.path.lexists(folder))
     if not there.is_dir() or not os.access(there, os.W_OK):
         raise OutputError(f"cannot write into {out}: {there} is {'not writable' if there.is_dir() else 'no folder'}")
-    if there == out.absolute() and any(out.iterdir()) and not force:
+    if there == out.absolute() and any(out.iterdir()) and not (force or _unfinished(out, command)):
         raise OutputError(f"{out} is not empty: name another folder with --out, or replace what is in it with --force")
+
+
+def _unfinished(out: Path, command: str) -> bool:
+    """Whether the folder is this command's, and its report lacks what failed or was never written."""
+    try:
+        record = json.loads((out / SWEEP_JSON).read_bytes())
+        return record["command"] == command and (bool(record["failures"]) or not (out / "report.html").exists())
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
 def _write(out: Path, found: _Found, command: str) -> None:
@@ -209,9 +223,10 @@ def _write(out: Path, found: _Found, command: str) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"cannot write into {out}: {error.strerror}") from error
+    # First, so that the same command knows the folder again.
+    write_whole(out / SWEEP_JSON, sweep_json(found.points, found.latencies, found.failures, found.done, command=command))
     write_whole(out / "points.csv", points_csv(found.points))
-    write_whole(out / "sweep.json", sweep_json(found.points, found.latencies, found.done))
-    write_report(out, found.points, found.latencies, command=command)
+    write_report(out, found.points, found.latencies, found.failures, command=command)
 
 
 def _names(text: str) -> list[str]:

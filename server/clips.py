@@ -9,6 +9,7 @@ from pathlib import Path
 from client.errors import InputError
 from client.video import VideoSource
 from server.job import content_sha256
+from server.names import shown
 from server.rate import whole_rate
 
 SCALES = (2, 3)
@@ -60,4 +61,4 @@ def clip_names(clips: Sequence[Clip]) -> dict[Path, str]:
         other = by_content.setdefault(clip.sha256, clip.path)
         if other is not clip.path:
             raise InputError(f"{other} and {clip.path} are the same clip: name it once")
-    return {clip.path: clip.path.stem if stems.count(clip.path.stem) == 1 else str(clip.path) for clip in clips}
+    return {clip.path: shown(clip.path.stem if stems.count(clip.path.stem) == 1 else str(clip.path)) for clip in clips}

@@ -95,6 +95,18 @@ class SweepDone:
 Event = PlanMade | PointReused | PointDone | PointFailed | Waiting | LatencyReused | LatencyDone | LatencyFailed | SweepDone
 
 
+def failure_record(failed: PointFailed | LatencyFailed) -> dict[str, Any]:
+    """What could not be measured, and why, ready for JSON; a latency has no bitrate that was asked for."""
+    named = failed.point if isinstance(failed, PointFailed) else failed
+    return {
+        "clip": named.clip,
+        "low_height": named.low_height,
+        "upscaler": named.upscaler,
+        "requested_kbps": failed.point.requested_kbps if isinstance(failed, PointFailed) else None,
+        "reason": failed.reason,
+    }
+
+
 def event_record(event: Event) -> dict[str, Any]:
     """The event by name, ready for JSON: `event` is its kind, as point_done; results as the store holds them."""
     kind = re.sub(r"(?<!^)(?=[A-Z])", "_", type(event).__name__).lower()

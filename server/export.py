@@ -8,7 +8,7 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-from server.events import SweepDone
+from server.events import LatencyFailed, PointFailed, SweepDone, failure_record
 from server.points import LatencyResult, PointResult
 
 
@@ -22,11 +22,20 @@ def points_csv(results: Sequence[PointResult]) -> str:
     return target.getvalue()
 
 
-def sweep_json(results: Sequence[PointResult], latencies: Sequence[LatencyResult], done: SweepDone) -> str:
-    """Every point with its settings, figures and reasons, every latency, and what the harness took."""
+def sweep_json(
+    results: Sequence[PointResult],
+    latencies: Sequence[LatencyResult],
+    failures: Sequence[PointFailed | LatencyFailed],
+    done: SweepDone,
+    *,
+    command: str,
+) -> str:
+    """Every point with its settings, figures and reasons, every latency, what could not be measured, and what the harness took."""
     record = {
+        "command": command,
         "points": [{"key": result.point.key, **result.record()} for result in results],
         "latencies": [latency.record() for latency in latencies],
+        "failures": [failure_record(failed) for failed in failures],
         "harness": {"work_s": done.work_s, "worker_s": done.worker_s, "overhead": done.overhead},
     }
     return json.dumps(record, indent=1, allow_nan=False) + "\n"

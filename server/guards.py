@@ -8,6 +8,7 @@ import hashlib
 import hmac
 import ipaddress
 import math
+import re
 import time
 from typing import Annotated
 from urllib.parse import urlsplit
@@ -51,6 +52,11 @@ def same_key(given: str, wanted: str) -> bool:
     return hmac.compare_digest(*digests)
 
 
+def is_public_name(name: str) -> bool:
+    """Whether this is how a browser names a host: HOST or HOST:PORT in small letters, nothing around it."""
+    return re.fullmatch(r"([a-z0-9_.-]+|\[[0-9a-f:]+\])(:[0-9]+)?", name) is not None
+
+
 def is_loopback(host: str) -> bool:
     """Whether a name or an address can mean nothing but this machine."""
     try:
@@ -64,12 +70,13 @@ class Guards:
 
     A browser that was led here from another site must not act for its user: a changing request of another origin is
     refused, and, where only this machine is meant to ask, so is any name of the host but the machine's own (a site can
-    make its name point at this address). Bodies are bounded in bytes, in the time between two pieces, and in that of all
-    of them, which for uploads is bounded where they are kept: their callers have shown the key by then.
+    make its name point at this address) and the one under which a proxy on this machine offers the service. Bodies are
+    bounded in bytes, in the time between two pieces, and in that of all of them, which for uploads is bounded where they
+    are kept: their callers have shown the key by then.
     """
 
-    def __init__(self, app: ASGIApp, *, limits: Limits, loopback: bool) -> None:
-        self._app, self._limits, self._loopback = app, limits, loopback
+    def __init__(self, app: ASGIApp, *, limits: Limits, loopback: bool, public_name: str | None) -> None:
+        self._app, self._limits, self._loopback, self._public_name = app, limits, loopback, public_name
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -93,10 +100,12 @@ class Guards:
 
     def _refusal(self, method: str, headers: Headers) -> str | None:
         host = headers.get("host", "")
-        if self._loopback and not is_loopback(_hostname(host)):
-            return "this service is for its own machine: use 127.0.0.1 or localhost"
+        public = [self._public_name] if self._public_name else []
+        if self._loopback and not is_loopback(_hostname(host)) and _hostname(host) not in map(_hostname, public):
+            return "this service is for its own machine: use 127.0.0.1 or localhost, or start it with --public-name behind a proxy"
         origin, site = headers.get("origin"), headers.get("sec-fetch-site", "none")
-        if method in _CHANGING and (site not in ("none", "same-origin") or (origin is not None and _netloc(origin) != host)):
+        other = origin is not None and _netloc(origin) not in (host, *public)
+        if method in _CHANGING and (site not in ("none", "same-origin") or other):
             return "a page of another origin may not do this"
         return None
 

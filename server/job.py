@@ -21,13 +21,14 @@ from client.sink import NullSink
 from client.upscaler import OnnxUpscaler
 from server.encoding import EncodedStream, clip_frames
 from server.lpips import Lpips
+from server.names import shown
 from server.points import Flag, Point, PointResult
 from server.versions import versions
 
 # Of the bitrate asked for: beyond it the point is flagged. Within it lies what rate control is off by on a clip of a second.
 TOLERANCE = 0.1
 Item = TypeVar("Item")
-_NOT_PLANNED = "{} is not the file that was planned with: it changed, or is another one on this machine"
+NOT_PLANNED = "{} is not the file that was planned with: it changed, or is another one on this machine"
 REFUSALS = (GamesrError, MemoryError, OSError)
 
 
@@ -141,11 +142,19 @@ def _content_sha256(path: Path, size: int, modified_ns: int) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def check_clips(job: Job) -> None:
+    """Raises InputError where the clip, or the one that was rendered small, is not what was planned with."""
+    point = job.asks[0].point
+    for path, expected in ((job.clip, point.clip_sha256), (job.low, point.low_sha256)):
+        if path is not None and content_sha256(path) != expected:
+            raise InputError(NOT_PLANNED.format(path))
+
+
 def sentence(error: Exception) -> str:
     """What to say of one of `REFUSALS`."""
     if isinstance(error, MemoryError):
         return "there was not enough memory: use fewer --jobs"
-    return f"working files cannot be written: {error.strerror}" if isinstance(error, OSError) else str(error)
+    return f"working files cannot be written: {error.strerror}" if isinstance(error, OSError) else shown(str(error))
 
 
 def _failed(ask: Ask, error: Exception) -> Failed:
@@ -154,9 +163,7 @@ def _failed(ask: Ask, error: Exception) -> Failed:
 
 def _encode(job: Job, work: _Work) -> EncodedStream:
     point = job.asks[0].point
-    for path, expected in ((job.clip, point.clip_sha256), (job.low, point.low_sha256)):
-        if path is not None and content_sha256(path) != expected:
-            raise InputError(_NOT_PLANNED.format(path))
+    check_clips(job)
     for name, version in versions(point.width, point.height).items():
         if version != point.versions[name]:
             raise GamesrError(f"{name} is {version} on this machine, but was {point.versions[name]} at planning: install the same one")
@@ -200,14 +207,14 @@ def _upscaler(ask: Ask) -> OnnxUpscaler | None:
         return None
     upscaler = OnnxUpscaler(ask.model, threads=1)
     if upscaler.spec.sha256 != ask.point.upscaler_sha256:
-        raise ModelError(_NOT_PLANNED.format(ask.model))
+        raise ModelError(NOT_PLANNED.format(ask.model))
     return upscaler
 
 
 def _lpips(path: Path, point: Point) -> Lpips:
     lpips = Lpips(path, threads=1)
     if lpips.version != point.versions["lpips"]:
-        raise ModelError(_NOT_PLANNED.format(path))
+        raise ModelError(NOT_PLANNED.format(path))
     return lpips
 
 

@@ -13,15 +13,22 @@ from itertools import islice
 from pathlib import Path
 
 from client.cores import machine_name, physical_cores
-from client.errors import InputError
+from client.errors import InputError, ModelError
 from client.measurement import WARM_UP_FRAMES, Task, in_fresh_process, measure
 from client.timing import Stamps, deadline_misses, stage_latencies
 from client.video import VideoSource
 from server.encoding import EncodedStream
-from server.job import Ask, Job, low_frames, settings
+from server.job import NOT_PLANNED, Ask, Job, check_clips, low_frames, settings
 from server.points import DEADLINES_FPS, LatencyResult
 
 FRAMES = 100  # that count: fewer have no 99th percentile
+
+
+def unmeasured(frames: int | None) -> str | None:
+    """Why there is no latency where at most so many frames of a clip count; None where there is one."""
+    if frames is None or frames > WARM_UP_FRAMES:
+        return None
+    return f"the first {WARM_UP_FRAMES} frames are warm-up, and no more than {frames} were asked for"
 
 
 def latency_key(ask: Ask) -> str:
@@ -42,11 +49,17 @@ class Stream:
 
 @contextmanager
 def encoded_beginning(job: Job) -> Iterator[Stream]:
-    """As many frames as latency is measured on, in a file for as long as the context lasts; raises what encoding raises."""
+    """As many frames as latency is measured on, in a file for as long as the context lasts.
+
+    Raises what encoding raises, and InputError for a clip that is another one by now, or over before the warm-up is.
+    """
+    check_clips(job)
     encoder = settings(job.asks[0].point)
     with tempfile.TemporaryDirectory(prefix="gamesr-sweep-") as folder:
         path = Path(folder) / "stream.h264"
         with closing(low_frames(job)) as frames, EncodedStream(islice(frames, WARM_UP_FRAMES + FRAMES), encoder) as encoded:
+            if encoded.frames <= WARM_UP_FRAMES:
+                raise InputError(f"{job.clip} has {encoded.frames} frames, of which {WARM_UP_FRAMES} are warm-up: use a longer clip")
             with path.open("wb") as file:
                 encoded.write(file)
             yield Stream(path, encoded.bitrate_kbps)
@@ -55,10 +68,10 @@ def encoded_beginning(job: Job) -> Iterator[Stream]:
 def measure_latency(ask: Ask, stream: Stream) -> LatencyResult:
     """Play the stream through the upscaler in a process of its own, with as many threads as a player would have.
 
-    Raises GamesrError, also for a stream that is over before the warm-up is.
+    Raises GamesrError, also for an artifact that is another one by now.
     """
     point = ask.point
-    played = in_fresh_process(_play, _Task(ask.model, stream.path), f"the process that measured {point.upscaler}")
+    played = in_fresh_process(_play, _Task(ask, stream.path), f"the process that measured {point.upscaler}")
     stages = stage_latencies(played)
     if ask.model is None:
         stages = {stage: stages[stage] for stage in ("decode", "total")}
@@ -81,15 +94,16 @@ def measure_latency(ask: Ask, stream: Stream) -> LatencyResult:
 
 @dataclass(frozen=True)
 class _Task:
-    model: Path | None
+    ask: Ask
     stream: Path
 
 
 def _play(task: _Task) -> list[Stamps]:
-    if task.model is not None:
-        return list(measure(Task(task.model, task.stream, FRAMES, "cpu", None)).stamps)
+    if task.ask.model is not None:
+        run = measure(Task(task.ask.model, task.stream, FRAMES, "cpu", None))
+        if run.spec.sha256 != task.ask.point.upscaler_sha256:
+            raise ModelError(NOT_PLANNED.format(task.ask.model))
+        return list(run.stamps)
     with VideoSource(task.stream) as source:
         times = [(decoded.packet_ns, decoded.decoded_ns) for decoded in islice(source, WARM_UP_FRAMES, None)]
-    if not times:
-        raise InputError(f"the clip has at most {WARM_UP_FRAMES} frames, which are warm-up: use a longer one")
     return [Stamps(packet_ns, decoded_ns, decoded_ns, decoded_ns) for packet_ns, decoded_ns in times]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import mimetypes
 import os
 import re
 import secrets
@@ -16,6 +17,7 @@ from pathlib import Path
 from client.errors import InputError, OutputError
 from server.clips import SCALES
 from server.database import Database
+from server.names import shown
 from server.probe import Known, probe
 from server.requests import NAME, StoredClip
 from server.settings import Settings
@@ -30,8 +32,8 @@ _LOOKED_AT = threading.Lock()  # one process looks at a clip at a time
 class Library:
     """A clip's name is looked up among the files that are there; no path is ever made of what a caller sent.
 
-    Of the folder, files of other suffixes, names that are no names, links, and what lies in folders below it are not seen. What is
-    found out about a file is remembered for as long as its size and time stay the same.
+    Of the folder, videos of other suffixes, names that are no names, and links are refused; what is no video, is hidden, or lies in
+    folders below it is not seen. What is found out about a file is remembered for as long as its size and time stay the same.
     """
 
     def __init__(self, database: Database, settings: Settings) -> None:
@@ -46,8 +48,9 @@ class Library:
 
     def clips(self) -> tuple[list[StoredClip], dict[str, str]]:
         """Every clip, and the files of the folder that cannot be used with the reason why."""
-        found, refused = [], {}
-        for name, path in sorted(self._files().items()):
+        found = []
+        files, refused = self._sorted_out()
+        for name, path in sorted(files.items()):
             try:
                 clip = self._clip(name, path)
             except InputError as error:
@@ -128,9 +131,19 @@ class Library:
             self._looked.set()
 
     def _files(self) -> dict[str, Path]:
-        in_folder = [path for path in _usable(self._settings.clips) if path.suffix.lower() in SUFFIXES]
-        files = {path.name: path for path in in_folder if not path.name.startswith(UPLOADED)}
-        return files | {path.name: path for path in _usable(self._settings.uploads) if path.name.startswith(UPLOADED)}
+        return self._sorted_out()[0]
+
+    def _sorted_out(self) -> tuple[dict[str, Path], dict[str, str]]:
+        """The files that may be clips, and the videos of the folder that may not with the reason why."""
+        files = {path.name: path for path in _entries(self._settings.uploads) if path.name.startswith(UPLOADED)}
+        refused = {}
+        for path in _entries(self._settings.clips):
+            reason = _unfit(path)
+            if reason is None:
+                files[path.name] = path
+            elif _is_video(path):
+                refused[shown(path.name)] = reason
+        return files, refused
 
     def _row(self, name: str, stamp: str) -> tuple[str, str | None, str | None] | None:
         rows = self._database.rows("SELECT title, known, refused FROM clips WHERE name = ? AND stamp = ?", name, stamp)
@@ -162,12 +175,32 @@ def _stamp(status: os.stat_result) -> str:
     return f"{status.st_size} {status.st_mtime_ns}"
 
 
-def _usable(folder: Path | None) -> Iterator[Path]:
+def _entries(folder: Path | None) -> Iterator[Path]:
+    """Files and links that are not hidden."""
     if folder is not None:
         with contextlib.suppress(OSError):
             for path in folder.iterdir():
-                if re.fullmatch(NAME, path.name) and path.is_file() and not path.is_symlink():
+                if not path.name.startswith(".") and (path.is_file() or path.is_symlink()):
                     yield path
+
+
+def _is_video(path: Path) -> bool:
+    """By its suffix, which is enough for saying why it is no clip."""
+    kind, _ = mimetypes.guess_type(f"name{path.suffix.lower()}")
+    return path.suffix.lower() in SUFFIXES or (kind or "").startswith("video/")
+
+
+def _unfit(path: Path) -> str | None:
+    """Why a file of the folder cannot be a clip, whatever is in it."""
+    if path.suffix.lower() not in SUFFIXES:
+        return f"its name does not end in one of {' '.join(SUFFIXES)}"
+    if path.is_symlink():
+        return "it is a link: put the file itself into the folder"
+    if not re.fullmatch(NAME, path.name):
+        return "its name is not of 1 to 96 of A-Z a-z 0-9 . _ -, a letter or digit first: rename it"
+    if path.name.startswith(UPLOADED):
+        return f"its name begins with {UPLOADED}, as those of uploads do: rename it"
+    return None
 
 
 def _stored(name: str, title: str, size_bytes: int, known: Known) -> StoredClip:

@@ -14,7 +14,7 @@ from client.frames import Frame
 from server.asked import AskedSweep
 from server.clips import PARTS, SCALES, Clip, clip_names
 from server.job import Ask, Job
-from server.latency import latency_key
+from server.latency import latency_key, unmeasured
 from server.lpips import Lpips
 from server.points import Point
 from server.upscalers import Artifact, Upscalers
@@ -25,14 +25,15 @@ from server.versions import versions
 class Request:
     """What the user asks for. `renders` are pairs of a clip and the same clip rendered small, which replaces its downscaling.
 
-    `heights` and `fps` are None for the default: half and a third of every clip's height, and its own rate. `frames` is the
-    most frames of a clip, None for all. `names` is what the clips are called, None for the names of their files.
+    `heights` and `fps` are None for the default: the parts of every clip's height that `scales` name, and its own rate. `frames`
+    is the most frames of a clip, None for all. `names` is what the clips are called, None for the names of their files.
     """
 
     clips: Sequence[Path]
     bitrates_kbps: Sequence[int]
     upscalers: Sequence[str]
     heights: Sequence[int] | None = None
+    scales: Sequence[int] = SCALES
     renders: Sequence[tuple[Path, Path]] = ()
     fps: int | None = None
     frames: int | None = None
@@ -42,7 +43,10 @@ class Request:
 
 @dataclass(frozen=True)
 class Plan:
-    """The jobs of a sweep, each of them one encode; and of every clip and height the one whose stream latency is taken on."""
+    """The jobs of a sweep, each of them one encode; and of every clip and height the one whose stream latency is taken on.
+
+    There are none of the latter where no frames would be left after the warm-up.
+    """
 
     jobs: tuple[Job, ...]
     latency_jobs: tuple[Job, ...]
@@ -88,7 +92,8 @@ def make_plan(request: Request) -> Plan:
             low = renders.get((clip.path, low_height))
             row = [encode.job(low_height, low, artifacts, bitrate_kbps) for bitrate_kbps in sorted(set(request.bitrates_kbps))]
             jobs += row
-            latency_jobs.append(row[len(row) // 2])
+            if unmeasured(request.frames) is None:
+                latency_jobs.append(row[len(row) // 2])
     upscalers.check_all_used()
     # The longest first, so that no worker is left alone with one at the end.
     return Plan(tuple(sorted(jobs, key=lambda job: -len(job.asks))), tuple(latency_jobs))
@@ -153,8 +158,8 @@ def _needed(request: Request, clip: Clip) -> float:
 
 
 def _heights(request: Request, clip: Clip, renders: Mapping[tuple[Path, int], Clip]) -> list[int]:
-    """The clip's own for the native curve, those that were asked for, by default half and a third, and those of renders."""
-    parts = [clip.height // scale for scale in SCALES if clip.divides(scale)]
+    """The clip's own for the native curve, those that were asked for, by default its parts that fit, and those of renders."""
+    parts = [clip.height // scale for scale in request.scales if clip.divides(scale)]
     wanted = parts if request.heights is None else request.heights
     return sorted({clip.height, *wanted, *(height for path, height in renders if path == clip.path)}, reverse=True)
 

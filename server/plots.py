@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from itertools import cycle, groupby, product
@@ -77,7 +78,8 @@ def over_time_figure(viewings: Mapping[str, Viewing]) -> Figure:
 def rendered(figure: Figure, kind: str) -> bytes:
     """The file's content as `svg` or `png`; the same figure always gives the same bytes."""
     target = io.BytesIO()
-    with _look():
+    with _look(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"Glyph \d+ .* missing from font", UserWarning)  # of a clip's name: a box says as much
         undated = {"Date": None} if kind == "svg" else {"Software": None}
         figure.savefig(target, format=kind, dpi=180, bbox_inches="tight", pad_inches=0.08, metadata=undated)
     return target.getvalue()

@@ -60,7 +60,7 @@ class Flag(Enum):
     """What a reader has to know of a point's bitrate."""
 
     ABOVE = "the encoder could not go down to the bitrate that was asked for"
-    BELOW = "the encoder had no use for the bitrate that was asked for"
+    BELOW = "the stream came out more than 10% below the bitrate that was asked for"
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from client.whole_file import write_whole
-from server.curves import METRICS, Series, series_by_clip
+from server.curves import METRICS, Series, label, series_by_clip
 from server.document import Block, Code, Heading, Picture, Table, Text, html_page, markdown
+from server.events import LatencyFailed, PointFailed, failure_record
+from server.latency import unmeasured
 from server.plots import latency_figure, rd_figures, rendered
 from server.points import LatencyResult, PointResult
 from server.tables import Notes, bd_table, latency_table, points_table, saving_table
@@ -16,7 +18,14 @@ TITLE = "What upscaling on the client buys, and what it costs"
 _FSR1 = ("fsr1", "easu")
 
 
-def write_report(folder: Path, points: Sequence[PointResult], latencies: Sequence[LatencyResult], *, command: str) -> list[Path]:
+def write_report(
+    folder: Path,
+    points: Sequence[PointResult],
+    latencies: Sequence[LatencyResult],
+    failures: Sequence[PointFailed | LatencyFailed],
+    *,
+    command: str,
+) -> list[Path]:
     """Write report.md, report.html and the figures, each as SVG and PNG, into a folder that is there.
 
     There is at least one point. Files of these names are replaced; each of them appears whole or not at all, the pages last.
@@ -26,7 +35,8 @@ def write_report(folder: Path, points: Sequence[PointResult], latencies: Sequenc
     if latencies:
         figures["latency"] = latency_figure(latencies)
     svg = {name: rendered(figure, "svg") for name, figure in figures.items()}
-    blocks = _page(points, latencies, [Picture(name, _description(name), content) for name, content in svg.items()], command)
+    pictures = [Picture(name, _description(name), content) for name, content in svg.items()]
+    blocks = [Heading(1, TITLE), Code(command), *_missing(failures), *_page(points, latencies, pictures)]
     files: dict[str, str | bytes] = {f"{name}.svg": content for name, content in svg.items()}
     files |= {f"{name}.png": rendered(figure, "png") for name, figure in figures.items()}
     files |= {"report.md": markdown(blocks), "report.html": html_page(TITLE, blocks)}
@@ -43,8 +53,27 @@ def _description(figure: str) -> str:
     return f"{titles[metric]} over bitrate, {height} upscaled and native resolution, one panel a clip"
 
 
-def _page(points: Sequence[PointResult], latencies: Sequence[LatencyResult], pictures: Sequence[Picture], command: str) -> list[Block]:
-    blocks: list[Block] = [Heading(1, TITLE), Code(command), *_setting(points, latencies), Heading(2, "Curves"), *pictures]
+def _missing(failures: Sequence[PointFailed | LatencyFailed]) -> list[Block]:
+    """Said before any figure: a curve with fewer points looks like any other."""
+    if not failures:
+        return []
+    points = sum(isinstance(failed, PointFailed) for failed in failures)
+    rows = []
+    for record in map(failure_record, failures):
+        asked = "latency" if record["requested_kbps"] is None else str(record["requested_kbps"])
+        rows.append([record["clip"], f"{label(record['upscaler'])} {record['low_height']}p", asked, record["reason"]])
+    return [
+        Heading(2, "What is missing"),
+        Text(
+            f"{points} points and {len(failures) - points} latencies could not be measured: the curves, BD-rates and savings below are "
+            "of the points that are there. The same command tries again what is missing."
+        ),
+        Table(["clip", "upscaler", "asked kbps", "why"], rows),
+    ]
+
+
+def _page(points: Sequence[PointResult], latencies: Sequence[LatencyResult], pictures: Sequence[Picture]) -> list[Block]:
+    blocks: list[Block] = [*_setting(points, latencies), Heading(2, "Curves"), *pictures]
     for clip, of_clip in series_by_clip(points).items():
         blocks += _clip(clip, of_clip, [latency for latency in latencies if latency.clip == clip])
     return blocks
@@ -70,7 +99,7 @@ def _setting(points: Sequence[PointResult], latencies: Sequence[LatencyResult]) 
         Code(str(first.encoder.get("x264_params", ""))),
         Text(f"Versions: {'; '.join(sorted(versions))}."),
         Text(_lpips(points)),
-        *(Text(text) for text in _latency_setting(latencies)),
+        *(Text(text) for text in _latency_setting(latencies, unmeasured(first.frames))),
         Text(
             "BD-rate is the percentage of bits that an upscaler takes more (+) or fewer (-) at equal quality; BD-VMAF and BD-PSNR are "
             "what it gains at equal bits: means over what both curves reach, in log bitrate, interpolated by PCHIP. No curve is "
@@ -97,9 +126,9 @@ def _lpips(points: Sequence[PointResult]) -> str:
     return "LPIPS, 0 is best, stands beside every point that it was measured of."
 
 
-def _latency_setting(latencies: Sequence[LatencyResult]) -> list[str]:
+def _latency_setting(latencies: Sequence[LatencyResult], reason: str | None) -> list[str]:
     if not latencies:
-        return ["Latency was not measured."]
+        return [f"Latency was not measured{f': {reason}' if reason else ''}."]
     machines = {f"{latency.threads} threads of {latency.machine}" for latency in latencies}
     texts = [
         f"Latency: {'; '.join(sorted(machines))}; taken in a pass of its own while nothing else of the sweep ran, warm-up not counted. "

@@ -22,6 +22,7 @@ def _whole(value: object) -> object:
 WholeNumber = Annotated[int, BeforeValidator(_whole)]
 Kbps = Annotated[WholeNumber, Field(ge=1, le=1_000_000)]
 Lines = Annotated[WholeNumber, Field(ge=2, le=8192)]
+Scale = Annotated[WholeNumber, Field(ge=2, le=3)]
 
 
 def _distinct(values: list[Any]) -> list[Any]:
@@ -40,8 +41,22 @@ class Sent(Schema):
     model_config = ConfigDict(frozen=True, allow_inf_nan=False, extra="forbid", strict=True)
 
 
+_SWEEP: dict[str, Any] = {
+    "clips": ["oa_koth1.mp4"],
+    "bitrates_kbps": [500, 1000, 2000, 4000],
+    "upscalers": ["none", "bicubic", "gamesr"],
+    "scales": [2],
+    "frames": 60,
+}
+
+
 class SweepRequest(Sent):
-    """A sweep to run. Heights must be the whole, a half or a third of each clip's height; null means half and third."""
+    """A sweep to run. Heights must be the whole, a half or a third of each clip's height; null means those that `scales` name.
+
+    `scales` are 2 for half and 3 for a third of whatever height a clip has; null means both, where the clip has them.
+    """
+
+    model_config = ConfigDict(json_schema_extra={"examples": [_SWEEP]})
 
     clips: Annotated[list[ClipName], Field(min_length=1, max_length=8, json_schema_extra=_UNIQUE), _DISTINCT]
     bitrates_kbps: Annotated[list[Kbps], Field(min_length=1, max_length=16, json_schema_extra=_UNIQUE), _DISTINCT] = Field(
@@ -51,8 +66,15 @@ class SweepRequest(Sent):
         default_factory=lambda: ["none", "bicubic", "lanczos", "fsr1", "gamesr"]
     )
     low_heights: Annotated[list[Lines], Field(min_length=1, max_length=4, json_schema_extra=_UNIQUE), _DISTINCT] | None = None
+    scales: Annotated[list[Scale], Field(min_length=1, max_length=2, json_schema_extra=_UNIQUE), _DISTINCT] | None = None
     fps: Annotated[WholeNumber, Field(ge=1, le=1000, description="a whole part of the clips' own rate, null for that rate")] | None = None
     frames: Annotated[WholeNumber, Field(ge=1, le=1_000_000, description="the most of a clip that count, null for all")] | None = None
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> Self:
+        if self.low_heights is not None and self.scales is not None:
+            raise ValueError("low_heights and scales say the same in two ways: send one of them")
+        return self
 
 
 class StoredClip(Schema):
@@ -104,8 +126,24 @@ class StagesSent(Sent):
 Word = Annotated[str, Field(min_length=1, max_length=120, pattern=r"^[ -~]+$")]
 
 
+_PLAYED: dict[str, Any] = {
+    "model": "gamesr",
+    "model_sha256": "0" * 64,
+    "provider": "cpu",
+    "threads": 2,
+    "machine": "my laptop",
+    "low_width": 960,
+    "low_height": 540,
+    "scale": 2,
+    "latency_us": {"total": {"count": 600, "p50": 9100, "p95": 12000, "p99": 19000, "max": 31000}},
+    "deadline_misses": {"30": 0, "60": 9, "120": 420},
+}
+
+
 class ClientLatencyRequest(Sent):
     """What a player's client saw while it played. `latency_us` and `deadline_misses` are as the client's own summary has them."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [_PLAYED]})
 
     model: Annotated[str, Field(pattern=NAME)]
     model_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -115,7 +153,7 @@ class ClientLatencyRequest(Sent):
     machine: Word
     low_width: Annotated[WholeNumber, Field(ge=1, le=8192)]
     low_height: Annotated[WholeNumber, Field(ge=1, le=8192)]
-    scale: Annotated[WholeNumber, Field(ge=2, le=3)]
+    scale: Scale
     latency_us: StagesSent
     deadline_misses: dict[Literal["30", "60", "120"], Annotated[WholeNumber, Field(ge=0, le=10**9)]] = Field(
         description="frames that took longer in total than one frame lasts, by frame rate"

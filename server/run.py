@@ -9,6 +9,7 @@ from contextlib import closing
 from pathlib import Path
 
 from client.errors import GamesrError, InputError
+from server.clips import SCALES
 from server.database import Database
 from server.events import (
     Event,
@@ -20,6 +21,7 @@ from server.events import (
     PointFailed,
     PointReused,
     Waiting,
+    failure_record,
 )
 from server.following import end_with_parent
 from server.library import Library
@@ -68,6 +70,7 @@ def _run(settings: Settings, queue: SweepQueue, queued: QueuedSweep, paths: dict
         bitrates_kbps=asked.bitrates_kbps,
         upscalers=asked.upscalers,
         heights=asked.low_heights,
+        scales=asked.scales or SCALES,
         fps=asked.fps,
         frames=asked.frames,
     )
@@ -97,14 +100,14 @@ class Tracker:
                 change |= {"points_total": points, "latencies_total": latencies}
             case PointDone() | PointReused():
                 change["points_done"] = before.points_done + 1
-            case PointFailed(point, reason):
+            case PointFailed():
                 change["points_failed"] = before.points_failed + 1
-                self._failed(point.clip, point.low_height, point.upscaler, point.requested_kbps, reason)
+                self._failed(event)
             case LatencyDone() | LatencyReused():
                 change["latencies_done"] = before.latencies_done + 1
-            case LatencyFailed(clip, low_height, upscaler, reason):
+            case LatencyFailed():
                 change["latencies_failed"] = before.latencies_failed + 1
-                self._failed(clip, low_height, upscaler, None, reason)
+                self._failed(event)
             case Waiting(reason):
                 change["waiting"] = reason
         self._measured += isinstance(event, PointDone | PointFailed)
@@ -115,12 +118,9 @@ class Tracker:
             remaining_s = elapsed_s / self._measured * (after.points_total - after.points_done - after.points_failed)
         self.progress = after.model_copy(update={"elapsed_s": elapsed_s, "remaining_s": remaining_s})
 
-    def _failed(self, clip: str, low_height: int, upscaler: str, requested_kbps: int | None, reason: str) -> None:
+    def _failed(self, failed: PointFailed | LatencyFailed) -> None:
         if len(self.failures) < MOST_FAILURES:
-            sentence = _without_paths(reason, self._paths)
-            self.failures.append(
-                Failure(clip=clip, low_height=low_height, upscaler=upscaler, requested_kbps=requested_kbps, reason=sentence)
-            )
+            self.failures.append(Failure(**failure_record(failed) | {"reason": _without_paths(failed.reason, self._paths)}))
 
 
 def _without_paths(sentence: str, paths: dict[str, Path | None]) -> str:

@@ -20,7 +20,7 @@ from typing import Self
 
 from client.command import command_parser, fail, whole_number
 from client.cores import physical_cores
-from client.errors import GamesrError, OutputError
+from client.errors import GamesrError, InputError, OutputError
 from server.database import Database
 from server.following import end_with_parent
 from server.queue import SweepQueue
@@ -116,6 +116,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     settings = Settings(arguments.store, arguments.data, arguments.clips, api_key=None, loopback=True, jobs=arguments.jobs)
     try:
+        check_clips_folder(settings.clips)
         settings.data.mkdir(parents=True, exist_ok=True)
         run_queue(settings)
     except KeyboardInterrupt:
@@ -147,12 +148,20 @@ def add_folders(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def check_clips_folder(clips: Path | None) -> None:
+    """Raises InputError for what --clips names and is no folder."""
+    if clips is not None and not clips.is_dir():
+        raise InputError(f"{clips} is not a folder: --clips names the one whose clips may be swept")
+
+
 def _follow_and_run(settings: Settings) -> None:
     end_with_parent()
     run_queue(settings)
 
 
 def _run(settings: Settings, queue: SweepQueue, sweep: str) -> None:
+    asked = queue[sweep].request
+    _LOG.info("sweep %s begins: %s on %s", sweep, ", ".join(asked.upscalers), ", ".join(asked.clips))
     process = multiprocessing.get_context("spawn").Process(target=run_queued, args=(settings, sweep))
     process.start()
     try:
@@ -164,6 +173,8 @@ def _run(settings: Settings, queue: SweepQueue, sweep: str) -> None:
         queue.end(sweep, "cancelled")
     else:  # says nothing where the sweep has said how it ended
         queue.end(sweep, "failed", "its process ended before it was done: too little memory is the usual reason")
+    end = queue[sweep].progress
+    _LOG.info("sweep %s is %s: %d points are there, %d failed", sweep, end.state, end.points_done, end.points_failed)
 
 
 def _end(process: BaseProcess) -> None:

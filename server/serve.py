@@ -15,10 +15,10 @@ from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 
-from client.command import command_parser, fail, fail_on_file, open_streams
+from client.command import command_parser, fail, fail_on_file, open_streams, whole_number
 from client.errors import GamesrError, InputError, OutputError, how_to_install
-from server.guards import is_loopback
-from server.runner import RunnerProcess, add_folders
+from server.guards import is_loopback, is_public_name
+from server.runner import RunnerProcess, add_folders, check_clips_folder
 from server.settings import Settings
 
 PROGRAM = "gamesr-serve"
@@ -36,8 +36,8 @@ examples:
 
 Everyone who can reach the service may read: results, clips' names and pictures. The key, of at least {LEAST_KEY} characters, is
 for what changes something: sweeps, uploads, posted latencies. Sweeps run one at a time, each in a process of its own at nice
-10; one that was running when the service ended goes on when it is started again. For TLS, or for more than one machine,
-put a proxy in front of it. Exit status: 0 ended, 1 refused (one sentence says why), 2 wrong usage.
+10; one that was running when the service ended goes on when it is started again. For TLS, put a proxy in front of it: with
+--public-name the service answers to that name too. Exit status: 0 ended, 1 refused (one sentence says why), 2 wrong usage.
 """
 
 
@@ -45,7 +45,8 @@ def parser() -> argparse.ArgumentParser:
     parser = command_parser(PROGRAM, "Serve what sweeps measured, as JSON, as Prometheus metrics and as a page.", EXAMPLES)
     add_folders(parser)
     parser.add_argument("--host", metavar="ADDRESS", default="127.0.0.1", help="where to listen (default: %(default)s)")
-    parser.add_argument("--port", metavar="N", type=_port, default=8060, help="the port there (default: %(default)s)")
+    parser.add_argument("--port", metavar="N", type=whole_number(0, 65535), default=8060, help="the port there (default: %(default)s)")
+    parser.add_argument("--public-name", metavar="HOST[:PORT]", help="what a proxy on this machine offers the service as; needs a key")
     parser.add_argument("--demo", action="store_true", help="open on the sample sweep, in a folder that is removed at the end")
     parser.add_argument("--no-runner", action="store_true", help="sweeps are run by a gamesr-runner, elsewhere on the same folders")
     return parser
@@ -80,11 +81,17 @@ def settings_of(arguments: argparse.Namespace, key: str | None) -> Settings:
     loopback = is_loopback(arguments.host)
     if key is None and not loopback:
         raise InputError(f"on {arguments.host} others could start sweeps: set {KEY_VARIABLE}, or leave out --host")
+    public_name = arguments.public_name and arguments.public_name.lower()
+    if public_name is not None and not is_public_name(public_name):
+        raise InputError(f"{arguments.public_name} is not the name of a host: --public-name has neither https:// nor a path")
+    if key is None and public_name is not None:
+        raise InputError(f"as {public_name} others could start sweeps: set {KEY_VARIABLE}, or leave out --public-name")
     if key is not None and (len(key) < LEAST_KEY or not key.isascii() or not key.isprintable()):
         raise InputError(f"{KEY_VARIABLE} must be {LEAST_KEY} printable characters or more: openssl rand -hex 16 makes one")
-    if arguments.clips is not None and not arguments.clips.is_dir():
-        raise InputError(f"{arguments.clips} is not a folder: --clips names the one whose clips may be swept")
-    return Settings(arguments.store, arguments.data, arguments.clips, api_key=key, loopback=loopback, jobs=arguments.jobs)
+    check_clips_folder(arguments.clips)
+    return Settings(
+        arguments.store, arguments.data, arguments.clips, api_key=key, loopback=loopback, jobs=arguments.jobs, public_name=public_name
+    )
 
 
 def serve(arguments: argparse.Namespace) -> None:
@@ -128,19 +135,15 @@ def _bind(host: str, port: int) -> socket.socket:
 
 
 def _demo(arguments: argparse.Namespace, folder: Path) -> None:
-    """The sample sweep beside its clip, in a folder that may be written to."""
+    """The sample sweep beside its clip, in a folder that may be written to; raises InputError where others are named, too."""
+    for name in ("store", "data", "clips"):
+        if getattr(arguments, name) != parser().get_default(name):
+            raise InputError(f"--demo has a store, a folder and a clip of its own: leave out --{name}, or --demo")
     try:
         shutil.copyfile(DEMO / "sweep.sqlite", folder / "sweep.sqlite")
     except OSError as error:
         raise InputError(f"the sample sweep cannot be copied to {folder}: {error.strerror}") from error
     arguments.store, arguments.data, arguments.clips = folder / "sweep.sqlite", folder / "data", DEMO
-
-
-def _port(text: str) -> int:
-    port = int(text)
-    if not 0 <= port <= 65535:
-        raise argparse.ArgumentTypeError(f"{text} is not a port")
-    return port
 
 
 def _interrupt(signum: int, frame: FrameType | None) -> None:

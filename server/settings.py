@@ -41,7 +41,8 @@ class Settings:
     """`store` is gamesr-sweep's file, `data` the service's own folder, `clips` the folder whose clips may be named.
 
     `api_key` is what changes have to be sent with; None asks for none, and is for loopback only. `loopback` says that only
-    this machine is meant to reach the service. `jobs` are the worker processes of a sweep.
+    this machine is meant to reach the service, `public_name` under which name a proxy on it lets others do so. `jobs` are the
+    worker processes of a sweep.
     """
 
     store: Path
@@ -50,6 +51,7 @@ class Settings:
     api_key: str | None = field(repr=False)
     loopback: bool
     jobs: int
+    public_name: str | None = None
     limits: Limits = Limits()
 
     @property

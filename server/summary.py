@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from server.events import SweepDone
+from server.latency import unmeasured
 from server.points import DEADLINES_FPS, LatencyResult, PointResult
 
 _FIGURES = {
@@ -59,4 +60,5 @@ def _reasons(results: Sequence[PointResult]) -> list[str]:
     heads = {name: head for head, (name, _) in _FIGURES.items()}
     found = [(heads[name], reason) for result in results for name, reason in result.quality.undefined.items() if name in heads]
     found += [("LPIPS", result.lpips_undefined) for result in results if result.lpips_undefined is not None]
+    found += [("latency", reason) for result in results if (reason := unmeasured(result.point.frames)) is not None]
     return [f"{head}: {reason}" for head, reason in dict.fromkeys(found)]

@@ -11,6 +11,7 @@ from client.errors import InputError, ModelError
 from client.models import find_model, shipped_models
 from client.upscaler import OnnxUpscaler
 from server.clips import PARTS, SCALES
+from server.names import shown
 from server.points import NO_UPSCALER
 
 
@@ -35,13 +36,13 @@ class Upscalers:
             if name == NO_UPSCALER:
                 self._by_scale[1][name] = None
                 continue
-            shown = Path(name).stem if Path(name).suffix == ".onnx" else name
+            called = shown(Path(name).stem) if Path(name).suffix == ".onnx" else name
             for path, spec in _artifacts(name):
                 of_scale = self._by_scale[spec.scale]
                 for other, artifact in of_scale.items():
-                    if other == shown or (artifact and artifact.sha256 == spec.sha256):
+                    if other == called or (artifact and artifact.sha256 == spec.sha256):
                         raise ModelError(f"upscaler {name} is asked for twice, or another one of its name or content is: name it once")
-                of_scale[shown] = Artifact(path, spec.sha256)
+                of_scale[called] = Artifact(path, spec.sha256)
 
     def at(self, scale: int) -> Mapping[str, Artifact | None]:
         """By name, in the order in which they were asked for; what is taken here counts as used."""

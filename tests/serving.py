@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +19,40 @@ import httpx
 import uvicorn
 
 from server.app import create_app
+from server.asked import AskedSweep
 from server.connections import bounded_protocol
+from server.points import LatencyResult, PointResult
 from server.settings import Limits, Settings
+from server.store import Store
+from tests.measured import latency_results, sweep_results
 
 KEY = "a key of more than sixteen characters"
 ROOT = Path(__file__).parent.parent
 WAIT_S = 120.0
+PLAYED: dict[str, Any] = {
+    "model": "gamesr",
+    "model_sha256": "0" * 64,
+    "provider": "cpu",
+    "threads": 2,
+    "machine": "a player's",
+    "low_width": 960,
+    "low_height": 540,
+    "scale": 2,
+    "latency_us": {"total": {"count": 50, "p50": 9000.0, "p95": 12000, "p99": 20000, "max": 30000}},
+    "deadline_misses": {"30": 0, "60": 2, "120": 40},
+}
 
 
-def settings(folder: Path, *, clips: Path | None = None, api_key: str | None = None, loopback: bool = True, **limits: Any) -> Settings:
-    return Settings(folder / "store.sqlite", folder / "data", clips, api_key, loopback, jobs=1, limits=Limits(**limits))
+def settings(
+    folder: Path,
+    *,
+    clips: Path | None = None,
+    api_key: str | None = None,
+    loopback: bool = True,
+    public_name: str | None = None,
+    **limits: Any,
+) -> Settings:
+    return Settings(folder / "store.sqlite", folder / "data", clips, api_key, loopback, 1, public_name, Limits(**limits))
 
 
 @contextlib.contextmanager
@@ -102,3 +126,30 @@ def events(client: httpx.Client, sweep: str) -> Iterator[dict[str, Any]]:
         for line in answer.iter_lines():
             if line.startswith("data: "):
                 yield json.loads(line.removeprefix("data: "))
+
+
+def filled(store: Path, results: Sequence[PointResult], latencies: Sequence[LatencyResult]) -> str:
+    """A store with a sweep of these; returns its id."""
+    with Store(store) as opened:
+        asked = AskedSweep.of([result.point for result in results], [f"latency {n}" for n in range(len(latencies))])
+        opened.keep_sweep(asked)
+        for result in results:
+            opened.keep_point(result)
+        for key, latency in zip(asked.latencies, latencies, strict=True):
+            opened.keep_latency(key, latency)
+    return asked.key[:16]
+
+
+@contextlib.contextmanager
+def serving_measured(folder: Path) -> Iterator[tuple[httpx.Client, str]]:
+    """A service over a sweep of two clips, and the sweep's path."""
+    of = settings(folder)
+    sweep = filled(of.store, sweep_results(), latency_results())
+    with serving(of) as client:
+        yield client, f"/api/v1/sweeps/{sweep}"
+
+
+def read(client: httpx.Client, path: str, **query: Any) -> Any:
+    answer = client.get(path, params=query)
+    assert answer.status_code == 200, answer.text
+    return answer.json()

@@ -12,6 +12,8 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
 
 from server.asked import AskedSweep
+from server.database import Database
+from server.queue import SweepQueue
 from server.store import Store
 from tests.browsing import Page, chromium
 from tests.measured import latency_results, sweep_results
@@ -234,6 +236,24 @@ def test_a_key_is_asked_for_when_the_service_wants_one(page: Page, tmp_path: Pat
         assert len(page.complaints()) == 1  # the 401
         page.click(".sweeps button[aria-label^=Cancel]")
         page.until(lambda: "cancelled" in page.text(".sweeps .words"))
+        page.leave()
+
+
+def test_a_half_is_of_each_clips_own_height(page: Page, tmp_path: Path, make_clip: Callable[..., Path]) -> None:
+    clips = tmp_path / "clips"
+    clips.mkdir()
+    for name, width, height in (("large.mp4", 96, 72), ("small.mp4", 64, 48)):
+        make_clip(f"clips/{name}", width=width, height=height)
+    of = settings(tmp_path, clips=clips)
+    with serving(of) as client:
+        page.open(str(client.base_url))
+        for name in ("large.mp4", "small.mp4"):
+            page.click(f"#start-clips input[value='{name}']")
+        page.click("#start-heights input[value='3']")
+        page.click("#start-form [type=submit]")
+        assert page.until(lambda: page.text("#sweep-status")) == "The sweep is queued."
+        (queued,) = SweepQueue(Database(of.database), most=1, kept=1).all()
+        assert (queued.request.clips, queued.request.scales) == (["large.mp4", "small.mp4"], [2])
         page.leave()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 
 from client.errors import OutputError
 from server.document import Code, Heading, Picture, Table, Text, html_page, markdown
+from server.events import LatencyFailed, PointFailed
 from server.points import Flag, PointResult
 from server.report import write_report
 from tests.measured import latency_results, sweep_results
@@ -21,7 +23,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
     folder = tmp_path_factory.mktemp("report")
     points = sweep_results(heights=(540,))
     points[0] = PointResult(**{**vars(points[0]), "flags": (Flag.ABOVE,)})
-    written = write_report(folder, points, latency_results(heights=(540,)), command=COMMAND)
+    written = write_report(folder, points, latency_results(heights=(540,)), [], command=COMMAND)
     assert sorted(written) == sorted(folder.iterdir())
     names = {path.name for path in written}
     assert {"report.md", "report.html", "latency.png", "latency.svg", "rd_vmaf_540p.png", "rd_vmaf_540p.svg"} <= names
@@ -82,16 +84,34 @@ def test_the_html_page_needs_no_other_file(pages: tuple[str, str]) -> None:
 
 
 def test_without_latencies_the_page_says_so(tmp_path: Path) -> None:
-    write_report(tmp_path, sweep_results(("map",), (540,))[:10], [], command="gamesr-sweep")
+    write_report(tmp_path, sweep_results(("map",), (540,))[:10], [], [], command="gamesr-sweep")
     assert "Latency was not measured." in (tmp_path / "report.md").read_text()
     assert not (tmp_path / "latency.png").exists()
+
+
+def test_what_could_not_be_measured_is_said_before_any_figure(tmp_path: Path) -> None:
+    *points, missing = sweep_results(("map",), (540,))
+    failures = [PointFailed(missing.point, "no <memory>", "trace"), LatencyFailed("map", 1080, "none", "no time", "trace")]
+    write_report(tmp_path, points, [], failures, command="gamesr-sweep")
+    page = (tmp_path / "report.md").read_text()
+    assert "1 points and 1 latencies could not be measured" in page
+    assert page.index("What is missing") < page.index("How it was measured") and "trace" not in page
+    assert row(page, "map", "gamesr 540p", "25000") == ["map", "gamesr 540p", "25000", r"no \<memory>"]
+    assert row(page, "map", "native 1080p", "latency")[-1] == "no time"
+
+
+def test_a_clips_name_that_the_font_has_not_is_no_warning(tmp_path: Path) -> None:
+    """Every warning is an error here, and this one would come once for each letter and figure."""
+    points = [replace(result, point=replace(result.point, clip="\u65e5\u672c")) for result in sweep_results(("map",), (540,))[:10]]
+    write_report(tmp_path, points, [], [], command="gamesr-sweep")
+    assert "\u65e5\u672c" in (tmp_path / "report.md").read_text()
 
 
 def test_a_report_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None:
     (tmp_path / "report.md").write_text("old")
     (tmp_path / "rd_vmaf_540p.svg").mkdir()
     with pytest.raises(OutputError, match=r"cannot write .*rd_vmaf_540p\.svg"):
-        write_report(tmp_path, sweep_results(("map",), (540,))[:10], [], command="gamesr-sweep")
+        write_report(tmp_path, sweep_results(("map",), (540,))[:10], [], [], command="gamesr-sweep")
     assert (tmp_path / "report.md").read_text() == "old"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["rd_vmaf_540p.svg", "report.md"]
 

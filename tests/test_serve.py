@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hmac
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,52 +17,16 @@ from server import guards
 from server.asked import AskedSweep
 from server.bdrate import Figure, Undefined, bitrate_at, saving
 from server.curves import METRICS, anchors, compare, series_by_clip
-from server.points import LatencyResult, PointResult
 from server.reading import StoreReader
 from server.store import Store
 from tests.measured import latency_results, sweep_results
-from tests.serving import KEY, serving, settings
-
-PLAYED: dict[str, Any] = {
-    "model": "gamesr",
-    "model_sha256": "0" * 64,
-    "provider": "cpu",
-    "threads": 2,
-    "machine": "a player's",
-    "low_width": 960,
-    "low_height": 540,
-    "scale": 2,
-    "latency_us": {"total": {"count": 50, "p50": 9000.0, "p95": 12000, "p99": 20000, "max": 30000}},
-    "deadline_misses": {"30": 0, "60": 2, "120": 40},
-}
-
-
-def filled(store: Path, results: Sequence[PointResult], latencies: Sequence[LatencyResult]) -> str:
-    """A store with a sweep of these; returns its id."""
-    with Store(store) as opened:
-        asked = AskedSweep.of([result.point for result in results], [f"latency {n}" for n in range(len(latencies))])
-        opened.keep_sweep(asked)
-        for result in results:
-            opened.keep_point(result)
-        for key, latency in zip(asked.latencies, latencies, strict=True):
-            opened.keep_latency(key, latency)
-    return asked.key[:16]
+from tests.serving import KEY, PLAYED, filled, read, serving, serving_measured, settings
 
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[httpx.Client, str]]:
-    """A service over a sweep of two clips, and the sweep's id."""
-    folder = tmp_path_factory.mktemp("serve")
-    of = settings(folder)
-    sweep = filled(of.store, sweep_results(), latency_results())
-    with serving(of) as client:
-        yield client, f"/api/v1/sweeps/{sweep}"
-
-
-def read(client: httpx.Client, path: str, **query: Any) -> Any:
-    answer = client.get(path, params=query)
-    assert answer.status_code == 200, answer.text
-    return answer.json()
+    with serving_measured(tmp_path_factory.mktemp("serve")) as served:
+        yield served
 
 
 def figure(number: Figure | None) -> dict[str, Any] | None:
@@ -246,22 +210,6 @@ def test_keys_are_compared_in_constant_time(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(guards.hmac, "compare_digest", spied)
     assert guards.same_key(KEY, KEY) and not guards.same_key("", KEY) and not guards.same_key("k" * 1000, KEY)
     assert compared == [(32, 32)] * 3
-
-
-def test_every_answer_says_what_a_browser_has_to_beware_of_and_no_other_origin_is_let_in(measured: tuple[httpx.Client, str]) -> None:
-    client, path = measured
-    for answer in (client.get(path), client.get("/nothing"), client.get("/"), client.post("/api/v1/sweeps", json={})):
-        policy = answer.headers["content-security-policy"]
-        assert "default-src 'none'" in policy and "script-src 'self'" in policy and "unsafe" not in policy
-        assert answer.headers["x-content-type-options"] == "nosniff" and answer.headers["x-frame-options"] == "DENY"
-        assert not any(name.startswith("access-control") for name in answer.headers) and "server" not in answer.headers
-    assert "access-control-allow-origin" not in client.get(path, headers={"Origin": "https://evil.example"}).headers
-    for headers in ({"Origin": "https://evil.example"}, {"Sec-Fetch-Site": "cross-site"}, {"Origin": "null"}, {"Origin": "http://["}):
-        assert client.post("/api/v1/client-latencies", json=PLAYED, headers=headers).status_code == 403
-    own = {"Origin": str(client.base_url).rstrip("/"), "Sec-Fetch-Site": "same-origin"}
-    assert client.post("/api/v1/client-latencies", json=PLAYED, headers=own).status_code == 201
-    assert client.get(path, headers={"Host": "evil.example"}).status_code == 403
-    assert client.get(path, headers={"Host": f"127.0.0.2:{client.base_url.port}"}).status_code == 200
 
 
 def test_errors_are_one_sentence_without_a_stack(

@@ -15,7 +15,7 @@ import pytest
 
 from server import serve
 from server.guards import is_loopback
-from tests.serving import KEY, ROOT, Command
+from tests.serving import KEY, ROOT, Command, serving, settings
 
 DOCUMENT = (ROOT / "docs/serve.md").read_text()
 
@@ -62,6 +62,37 @@ def test_what_it_cannot_use_is_one_sentence(tmp_path: Path, capsys: pytest.Captu
         assert "cannot listen on 127.0.0.1" in sentence
     (tmp_path / "data/service.sqlite").write_bytes((ROOT / "server/demo/sweep.sqlite").read_bytes())
     assert "not of this version of gamesr-serve" in refusal(capsys, *folders, "--store", tmp_path / "store")
+
+
+def test_a_public_name_needs_a_key_and_is_a_name(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(serve.KEY_VARIABLE, raising=False)
+    assert "set GAMESR_API_KEY" in refusal(capsys, "--public-name", "gamesr.example.com")
+    for name in ("https://gamesr.example.com", "gamesr.example.com/sr", "me@gamesr.example.com", "a b", "", "[", "gamesr.example.com?x"):
+        monkeypatch.setenv(serve.KEY_VARIABLE, KEY)  # which the command takes out of its environment
+        assert "is not the name of a host" in refusal(capsys, "--public-name", name)
+    for name in ("gamesr.example.com", "Gamesr.Example.com:8443", "[2001:db8::1]:8443"):
+        of = serve.settings_of(serve.parser().parse_args(["--public-name", name]), KEY)
+        assert of.public_name == name.lower() and of.loopback
+
+
+@pytest.mark.parametrize("option", ["store", "data", "clips"])
+def test_the_demo_takes_no_others_files(tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str) -> None:
+    assert f"leave out --{option}, or --demo" in refusal(capsys, "--demo", f"--{option}", tmp_path / "mine")
+
+
+@pytest.mark.parametrize("port", ["abc", "65536", "-1"])
+def test_what_is_no_port_is_said(port: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        serve.main([f"--port={port}"])
+    assert exit_.value.code == 2 and f"{port} is not a whole number from 0 to 65535" in capsys.readouterr().err
+
+
+def test_every_figure_for_prometheus_is_in_the_documentation(tmp_path: Path) -> None:
+    with serving(settings(tmp_path)) as client:
+        client.get("/health")
+        names = re.findall(r"^# TYPE (\w+)", client.get("/metrics").text, re.MULTILINE)
+    missing = [name for name in names if f"`{name}`" not in DOCUMENT and not name.endswith("_created")]
+    assert len(names) >= 10 and missing == []
 
 
 def test_an_address_that_cannot_be_printed_is_one_sentence() -> None:

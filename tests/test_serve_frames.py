@@ -84,6 +84,17 @@ def test_a_picture_is_that_of_the_sweep(client: httpx.Client, of: Settings, tmp_
     assert np.array_equal(picture(client, 3, picture="none", bitrate_kbps=200, fps=15), to_rgb(every_other[3]))
 
 
+def test_a_picture_that_the_caller_has_is_not_sent_again(client: httpx.Client) -> None:
+    picture(client, 5)
+    first = client.get(f"{FRAMES}/5")
+    for known in (first.headers["etag"], f'"another", W/{first.headers["etag"]}'):
+        again = client.get(f"{FRAMES}/5", headers={"If-None-Match": known})
+        assert (again.status_code, again.content) == (304, b"")
+        assert [again.headers[name] for name in ("etag", "cache-control")] == [first.headers[name] for name in ("etag", "cache-control")]
+    assert client.get(f"{FRAMES}/5", headers={"If-None-Match": '"another"'}).content == first.content
+    assert client.head(f"{FRAMES}/5").headers["etag"] == first.headers["etag"]
+
+
 @pytest.mark.parametrize(
     ("path", "query", "status", "sentence"),
     [

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,12 +14,13 @@ import httpx
 import psutil
 import pytest
 
+from server import runner
 from server.events import LatencyFailed, PlanMade, PointFailed, PointReused, Waiting
 from server.run import Tracker
 from server.runner import RunnerProcess, runs
 from server.settings import Settings
 from tests.measured import sweep_results
-from tests.serving import Command, events, serving, settings, until
+from tests.serving import ROOT, Command, events, serving, settings, until
 from tests.sweeping import plan_of, sweep_here
 
 SMALL: dict[str, Any] = {"bitrates_kbps": [200, 400], "upscalers": ["none", "bicubic"], "low_heights": [36]}
@@ -105,8 +109,10 @@ def test_the_queue_is_bounded(folder: Path) -> None:
         start(client)
 
 
-def test_what_cannot_be_swept_is_refused_while_the_caller_listens(folder: Path) -> None:
+def test_what_cannot_be_swept_is_refused_while_the_caller_listens(folder: Path, make_clip: Callable[..., Path]) -> None:
     (folder / "clips/text.mkv").write_text("no video")
+    (folder / "clips/copy.mkv").write_bytes((folder / "clips/clip.mkv").read_bytes())
+    make_clip("clips/half.mkv", width=104, height=72)
     (folder / "secret.mkv").write_bytes((folder / "clips/clip.mkv").read_bytes())
     (folder / "clips/link.mkv").symlink_to(folder / "secret.mkv")
     cases: list[tuple[dict[str, Any], int, str]] = [
@@ -118,6 +124,11 @@ def test_what_cannot_be_swept_is_refused_while_the_caller_listens(folder: Path) 
         ({"clips": ["clip.mkv"], "upscalers": ["sharpest"]}, 422, "there is no upscaler sharpest"),
         ({"clips": ["clip.mkv"], "upscalers": ["../../x.onnx"]}, 422, "should match pattern"),
         ({"clips": ["clip.mkv"], "low_heights": [40]}, 422, "cannot be encoded at 40 lines, only at 72, 36, 24"),
+        ({"clips": ["half.mkv"], "scales": [3]}, 422, "half.mkv cannot be encoded at 24 lines, only at 72, 36"),
+        ({"clips": ["clip.mkv"], "scales": [2], "low_heights": [36]}, 422, "send one of them"),
+        ({"clips": ["clip.mkv"], "scales": [4]}, 422, "less than or equal to 3"),
+        ({"clips": ["clip.mkv", "half.mkv", "copy.mkv"]}, 422, "clip.mkv and copy.mkv are the same clip: name it once"),
+        ({"clips": ["clip.mkv"], "upscalers": ["none", "bicubic"], "low_heights": [72]}, 422, "a half or a third of a clip's"),
         ({"clips": ["clip.mkv"], "fps": 7}, 422, "no whole part"),
         ({"clips": ["clip.mkv"], "bitrates_kbps": []}, 422, "at least 1 item"),
         ({"clips": ["clip.mkv"], "bitrates_kbps": [100, 100]}, 422, "twice"),
@@ -129,24 +140,101 @@ def test_what_cannot_be_swept_is_refused_while_the_caller_listens(folder: Path) 
             assert answer.status_code == status and sentence in answer.json()["detail"], (sent, answer.text)
             assert str(folder) not in answer.text
         clips = client.get("/api/v1/clips").json()
-        assert [clip["name"] for clip in clips["clips"]] == ["clip.mkv"] and list(clips["refused"]) == ["text.mkv"]
+        assert [clip["name"] for clip in clips["clips"]] == ["clip.mkv", "copy.mkv", "half.mkv"]
+        assert sorted(clips["refused"]) == ["link.mkv", "text.mkv"]
         assert clips["clips"][0]["low_heights"] == [72, 36, 24] and client.get("/api/v1/sweeps").json() == {"sweeps": []}
 
 
 def test_a_sweep_that_fails_says_why_without_the_services_paths(folder: Path) -> None:
     with serving(of(folder)) as client:
-        odd, gone = start(client, upscalers=["bicubic"], low_heights=[72]), start(client)
+        gone = start(client)
         (folder / "clips/clip.mkv").rename(folder / "clips/other.mkv")
         late = start_of(client, "other.mkv")
         with RunnerProcess(of(folder)):
             until(lambda: state(client, late) == "done")
-        reasons = {sweep: client.get(f"/api/v1/sweeps/{sweep}").json()["progress"]["reason"] for sweep in (odd, gone)}
-        assert "is not there any more" in reasons[odd] and "is not there any more" in reasons[gone]
-        unfit = start_of(client, "other.mkv", upscalers=["bicubic"], low_heights=[72])
+        assert "is not there any more" in client.get(f"/api/v1/sweeps/{gone}").json()["progress"]["reason"]
+        unfit = start_of(client, "other.mkv")
+        (folder / "clips/other.mkv").write_text("no video")
         with RunnerProcess(of(folder)):
             until(lambda: state(client, unfit) == "failed")
         reason = client.get(f"/api/v1/sweeps/{unfit}").json()["progress"]["reason"]
-        assert "bicubic needs a height that is a half or a third" in reason and str(folder) not in reason
+        assert reason.startswith("other.mkv is not a video file") and str(folder) not in reason
+
+
+def test_too_few_frames_for_a_latency_are_no_failure_and_a_clip_of_so_few_is_named(folder: Path, make_clip: Callable[..., Path]) -> None:
+    make_clip("clips/short.mkv", width=96, height=72, frames=4)
+    with serving(of(folder)) as client:
+        few, short = start(client, frames=4), start_of(client, "short.mkv")
+        with RunnerProcess(of(folder)):
+            until(lambda: state(client, short) == "done")
+        first, second = (client.get(f"/api/v1/sweeps/{sweep}").json() for sweep in (few, short))
+        assert (first["progress"]["latencies_total"], first["failures"]) == (0, []) and first["progress"]["points_done"] == 4
+        assert {failure["reason"] for failure in second["failures"]} == {
+            "short.mkv has 4 frames, of which 5 are warm-up: use a longer clip"
+        }
+
+
+def test_scales_are_of_each_clips_own_height(folder: Path, make_clip: Callable[..., Path]) -> None:
+    """A third of the one is a half of the other."""
+    make_clip("clips/small.mkv", width=64, height=48)
+    with serving(of(folder)) as client:
+        asked = {"clips": ["clip.mkv", "small.mkv"], **SMALL, "low_heights": None, "scales": [2], "frames": 3}
+        answer = client.post("/api/v1/sweeps", json=asked)
+        assert answer.status_code == 202, answer.text
+        with RunnerProcess(of(folder)):
+            until(lambda: state(client, answer.json()["id"]) == "done")
+        points = client.get(f"/api/v1/sweeps/{answer.json()['id']}/points").json()["points"]
+    heights = {(point["clip"], point["low_height"]) for point in points}
+    assert heights == {("clip.mkv", 72), ("clip.mkv", 36), ("small.mkv", 48), ("small.mkv", 24)}
+
+
+def test_a_sweep_of_other_names_is_a_sweep_of_its_own(folder: Path) -> None:
+    with serving(of(folder)) as client:
+        first = start(client, frames=3)
+        with RunnerProcess(of(folder)):
+            until(lambda: state(client, first) == "done")
+            (folder / "clips/clip.mkv").rename(folder / "clips/third.mkv")
+            second = start_of(client, "third.mkv", frames=3)
+            until(lambda: state(client, second) == "done")
+        assert [clip["clip"] for clip in client.get(f"/api/v1/sweeps/{second}").json()["clips"]] == ["third.mkv"]
+        assert len(client.get(f"/api/v1/sweeps/{second}/points", params={"clip": "third.mkv"}).json()["points"]) == 4
+
+
+def test_a_folders_videos_that_are_no_clips_are_refused_with_the_reason(folder: Path) -> None:
+    content = (folder / "clips/clip.mkv").read_bytes()
+    unfit = ("My match.mp4", "spiel_\u00f6.mkv", "<b>.mkv", os.fsdecode(b"caf\xe9.mkv"))
+    for name in (*unfit, "MATCH.MPG", "upload-0.mp4", ".hidden.mkv", "a.txt"):
+        (folder / "clips" / name).write_bytes(content)
+    (folder / "clips/link.mkv").symlink_to(folder / "clips/clip.mkv")
+    (folder / "clips/folder.mkv").mkdir()
+    with serving(of(folder)) as client:
+        answer = client.get("/api/v1/clips")
+        assert answer.status_code == 200 and [clip["name"] for clip in answer.json()["clips"]] == ["clip.mkv"]
+    refused = answer.json()["refused"]
+    assert set(refused) == {"My match.mp4", "spiel_\u00f6.mkv", "MATCH.MPG", "upload-0.mp4", "<b>.mkv", "caf\\xe9.mkv", "link.mkv"}
+    assert {refused[name] for name in ("My match.mp4", "spiel_\u00f6.mkv", "<b>.mkv", "caf\\xe9.mkv")} == {
+        "its name is not of 1 to 96 of A-Z a-z 0-9 . _ -, a letter or digit first: rename it"
+    }
+    assert "does not end in one of .mp4" in refused["MATCH.MPG"] and "is a link" in refused["link.mkv"]
+    assert "as those of uploads do" in refused["upload-0.mp4"]
+
+
+def test_the_runner_says_what_it_runs_and_refuses_what_is_no_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with serving(of(folder)) as client:
+        sweep = start(client)
+    (folder / "clips/clip.mkv").unlink()
+    arguments = [f"--store={folder}/store.sqlite", f"--data={folder}/data"]
+    command = [sys.executable, "-c", "from server.runner import main; raise SystemExit(main())", *arguments, f"--clips={folder}/clips"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        assert process.stderr is not None
+        said = [process.stderr.readline() for _ in range(2)]
+        process.terminate()
+    assert said == [
+        f"INFO server.runner: sweep {sweep} begins: none, bicubic on clip.mkv\n",
+        f"INFO server.runner: sweep {sweep} is failed: 0 points are there, 0 failed\n",
+    ]
+    assert runner.main([*arguments, f"--clips={folder}/nosuch"]) == 1
+    assert capsys.readouterr().err.startswith(f"gamesr-runner: {folder}/nosuch is not a folder")
 
 
 def start_of(client: httpx.Client, clip: str, **more: Any) -> str:

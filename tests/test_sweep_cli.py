@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 import signal
 import sqlite3
 import subprocess
@@ -138,6 +139,57 @@ def test_what_fails_is_said_at_the_end_and_the_rest_stays(
     status, out, err = run(capsys, *arguments)
     assert status == 1 and "1 points measured, 0 reused, 1 failed" in out
     assert "2 points or latencies could not be measured" in err and "not as many frames" in err and err.count("\n") == 1
+
+
+def test_a_report_that_lacks_what_failed_says_so_and_the_same_command_goes_on(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(self: object, target: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    out = tmp_path / "out"
+    arguments = (clip, *SMALL, "--upscalers", "none,bicubic", "--store", tmp_path / "store", "--out", out)
+    with monkeypatch.context() as patch:
+        patch.setattr("server.encoding.EncodedStream.write", full)
+        assert run(capsys, *arguments)[0] == 1
+    record = json.loads((out / "sweep.json").read_text())
+    reason = "working files cannot be written: No space left on device"
+    assert [(failed["upscaler"], failed["requested_kbps"], failed["reason"]) for failed in record["failures"]] == [
+        ("none", None, reason),
+        ("bicubic", None, reason),
+    ]
+    for page in ("report.md", "report.html"):
+        said = (out / page).read_text()
+        assert "0 points and 2 latencies could not be measured" in said and reason in said
+    assert "is not empty" in refusal(capsys, *arguments, "--frames", "6")
+    assert run(capsys, *arguments)[0] == 0 and json.loads((out / "sweep.json").read_text())["failures"] == []
+    assert "could not be measured" not in (out / "report.md").read_text()
+    assert "is not empty" in refusal(capsys, *arguments)
+    (out / "report.html").unlink()  # as when it was killed in mid-report
+    assert run(capsys, *arguments)[0] == 0 and (out / "report.html").exists()
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"command": 1, "failures": [1]}'])
+def test_a_folder_of_somebody_else_is_not_written_into(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str
+) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/sweep.json").write_text(content)
+    assert "is not empty" in refusal(capsys, clip, *SMALL, "--store", tmp_path / "store", "--out", tmp_path / "out")
+
+
+def test_names_that_are_no_text_are_written_as_far_as_they_are(
+    clip: Path, model_file: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    odd, model = (clip.parent / os.fsdecode(name) for name in (b"caf\xe9.mkv", b"mod\xe8le.onnx"))
+    clip.rename(odd)
+    model_file("mine.onnx").rename(model)
+    more = ("--frames", "3", "--store", tmp_path / "store", "--out", tmp_path / os.fsdecode(b"r\xe9sultat"))
+    status, out, err = run(capsys, odd, *SMALL, "--upscalers", f"none,{model}", *more)
+    assert (status, err) == (0, "") and "caf\\xe9" in out and "mod\\xe8le" in out
+    assert "no latency: the first 5 frames are warm-up, and no more than 3 were asked for" in out
+    page = (more[-1] / "report.html").read_text()  # type: ignore[operator]
+    assert "caf\\xe9" in page and "mod\\xe8le" in page and "not measured: the first 5 frames are warm-up" in page
 
 
 def test_names_stay_apart_where_two_clips_are_called_alike(make_clip: Callable[..., Path], tmp_path: Path) -> None:

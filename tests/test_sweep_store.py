@@ -80,6 +80,28 @@ def test_a_record_that_no_sweep_has_written_is_one_sentence_with_the_stores_name
             assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_the_same_question_under_other_names_is_another_sweep(tmp_path: Path) -> None:
+    """As when two files have changed their names with each other."""
+    points = [replace(result(number).point, clip=name) for number, name in ((1, "a"), (2, "b"))]
+    swapped = [replace(result(number).point, clip=name) for number, name in ((1, "b"), (2, "a"))]
+    model = [replace(point, upscaler="mine") for point in points]
+    asked = [AskedSweep.of(each, ["key"]) for each in (points, swapped, model, points[::-1])]
+    with Store(tmp_path / "store") as store:
+        for sweep in asked:
+            store.keep_sweep(sweep)
+    kept = StoreReader(tmp_path / "store").sweeps()
+    assert set(kept) == {sweep.key for sweep in asked[:3]} and asked[3].key == asked[0].key
+    assert [clip.name for clip in kept[asked[1].key].asked.clips] == ["b", "a"]
+
+
+def test_a_sweep_that_was_kept_under_its_keys_alone_is_still_read(tmp_path: Path) -> None:
+    asked = AskedSweep.of([result(1).point], ["key"])
+    with Store(tmp_path / "store") as store:
+        store.keep_sweep(asked)
+        store._connection.execute("UPDATE sweeps SET key = 'as it was made before'")
+        assert list(StoreReader(tmp_path / "store").sweeps()) == ["as it was made before"]
+
+
 def test_all_of_many_sweeps_that_begin_at_once_open_one_new_store(tmp_path: Path) -> None:
     together = Barrier(8)
 

@@ -78,13 +78,12 @@ export class StartForm {
     if (!bitrates.every((kbps) => kbps >= 1)) throw new Error("Bitrates are numbers of megabits a second with commas between them, such as 2, 4, 8.");
     const parts = chosen(this.#field("heights")).map(Number);
     if (!parts.length) throw new Error("Choose from which heights is to be upscaled.");
-    const heights = clips.flatMap((name) => parts.map((part) => this.#clips.find((clip) => clip.name === name).height / part));
     const frames = this.#field("frames").value;
     return {
       clips,
       bitrates_kbps: bitrates,
       upscalers: chosen(this.#field("upscalers")),
-      low_heights: parts.length === Object.keys(PARTS).length ? null : [...new Set(heights)],
+      scales: parts.length === Object.keys(PARTS).length ? null : parts, // both: a clip that has only one of them will do
       frames: frames ? Number(frames) : null,
     };
   }

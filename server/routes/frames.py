@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from typing import Annotated, Any
 
-from fastapi import APIRouter, HTTPException, Path, Query, Response
+from fastapi import APIRouter, Header, HTTPException, Path, Query, Response
 from fastapi.responses import JSONResponse
 
 from client.errors import GamesrError
@@ -23,6 +23,7 @@ _AGAIN_S = 1
 _PICTURE: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}, "description": "the picture"},
     202: {"model": Problem, "description": "it is being computed: ask again after Retry-After seconds"},
+    304: {"description": "it is what If-None-Match names"},
 }
 
 router = APIRouter(prefix="/frames", tags=["frames"])
@@ -37,6 +38,7 @@ def read_frame(
     low_height: Annotated[int | None, Query(ge=2, le=8192, description="where it is encoded; for a model only")] = None,
     bitrate_kbps: Annotated[int | None, Query(ge=1, le=1_000_000, description="as asked of the encoder; not for reference")] = None,
     fps: Annotated[int | None, Query(ge=1, le=1000, description="of the sweep, by default the clip's own")] = None,
+    if_none_match: Annotated[str | None, Header(description="the ETag of a picture that the caller has")] = None,
 ) -> Response:
     """One picture as a player would see it, the same that the sweep measured."""
     found = find_clip(service, clip)
@@ -51,7 +53,10 @@ def read_frame(
         waits = Problem(detail="this frame is being computed: ask again")
         return JSONResponse(waits.model_dump(), 202, {"Retry-After": str(_AGAIN_S)})
     tag = f'"{hashlib.sha256(content).hexdigest()[:16]}"'
-    return Response(content, media_type="image/png", headers={"Cache-Control": "private, max-age=3600", "ETag": tag})
+    headers = {"Cache-Control": "private, max-age=3600", "ETag": tag}
+    if tag in [each.strip().removeprefix("W/") for each in (if_none_match or "").split(",")]:
+        return Response(status_code=304, headers=headers)
+    return Response(content, media_type="image/png", headers=headers)
 
 
 def _still(

@@ -12,6 +12,7 @@ from fastapi import APIRouter, Depends, HTTPException, Path
 from fastapi.responses import StreamingResponse
 
 from server.cards import artifacts
+from server.clips import PARTS
 from server.guards import require_key
 from server.points import NO_UPSCALER
 from server.queue import QueueFullError
@@ -113,13 +114,28 @@ def _found(service: Service, sweep: str) -> Sweep:
 
 def _check(asked: SweepRequest, clips: list[StoredClip]) -> None:
     """What planning would refuse, said while the caller listens; planning knows more and may still refuse."""
-    names = {NO_UPSCALER, *(artifact.name for artifact in artifacts())}
-    unknown = [name for name in asked.upscalers if name not in names]
+    scales_of = {NO_UPSCALER: {1}}
+    for artifact in artifacts():
+        scales_of.setdefault(artifact.name, set()).add(artifact.scale)
+    unknown = [name for name in asked.upscalers if name not in scales_of]
     if unknown:
-        raise HTTPException(422, f"there is no upscaler {unknown[0]}: there is {', '.join(sorted(names))}")
+        raise HTTPException(422, f"there is no upscaler {unknown[0]}: there is {', '.join(sorted(scales_of))}")
+    by_content: dict[str, str] = {}
+    scales = {1}
     for clip in clips:
-        unfit = [height for height in asked.low_heights or [] if height not in clip.low_heights]
+        other = by_content.setdefault(clip.sha256, clip.name)
+        if other != clip.name:
+            raise HTTPException(422, f"{other} and {clip.name} are the same clip: name it once")
+        wanted = asked.low_heights or [clip.height // scale for scale in asked.scales or []]
+        native = [clip.height] if NO_UPSCALER in asked.upscalers else []
+        unfit = [height for height in (*wanted, *native) if height not in clip.low_heights]
         if unfit:
-            raise HTTPException(422, f"{clip.name} cannot be encoded at {unfit[0]} lines, only at {', '.join(map(str, clip.low_heights))}")
+            there = ", ".join(map(str, clip.low_heights)) or "none"
+            raise HTTPException(422, f"{clip.name} cannot be encoded at {unfit[0]} lines, only at {there}")
         if asked.fps is not None and clip.fps % asked.fps:
             raise HTTPException(422, f"{clip.name} has {clip.fps} frames a second, of which {asked.fps} is no whole part")
+        scales |= {clip.height // height for height in wanted or clip.low_heights}
+    for name in asked.upscalers:
+        if not scales_of[name] & scales:
+            parts = " or ".join(f"a {PARTS[scale]}" for scale in sorted(scales_of[name]))
+            raise HTTPException(422, f"upscaler {name} needs a height that is {parts} of a clip's")
