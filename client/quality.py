@@ -14,7 +14,7 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from client.errors import InputError
-from client.frames import Frame, Plane
+from client.frames import ColourTags, Frame, Plane
 from client.vmaf import THREADS, VmafRun, why_unavailable
 
 PEAK = 255
@@ -138,6 +138,12 @@ def _ssim_total(moments: Image) -> float:
     return float(similarity.sum())
 
 
+def may_be_of_one_coding(one: ColourTags, other: ColourTags) -> bool:
+    """Whether equal codes may be equal colours: range and matrix are the same, or one of the two does not say."""
+    ranges, matrices = {one.range, other.range}, {one.matrix, other.matrix}
+    return (0 in ranges or len(ranges) == 1) and (2 in matrices or len(matrices) == 1)
+
+
 class QualityMeter:
     """Measures a clip against its reference while both stream by; a context manager, since VMAF runs in a process of its own.
 
@@ -223,9 +229,7 @@ class QualityMeter:
                 size = f"{frame.width}x{frame.height}"
                 raise InputError(f"frame {self._frames} of the {what} clip is {size} where {width}x{height} is compared")
         ours, theirs = distorted.colour, reference.colour
-        if (ours.range and theirs.range and ours.range != theirs.range) or (
-            2 not in (ours.matrix, theirs.matrix) and ours.matrix != theirs.matrix
-        ):
+        if not may_be_of_one_coding(ours, theirs):
             raise InputError(
                 f"the clips are not of one colour coding (measured: range {ours.range}, matrix {ours.matrix}; "
                 f"reference: range {theirs.range}, matrix {theirs.matrix}): convert the reference first"

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from client.artifact import load_session
 from client.errors import InputError, ModelError
 from model.artifact_weights import network_of_artifact
 from model.catalogue import described_network
@@ -18,10 +19,12 @@ def averaged(network: Network, artifact: Path, share: float) -> Network:
 
     Runs that began from the same weights end so near to each other that between them the error is no larger, and mostly smaller, than
     at either (model soups, Wortsman et al. 2022): what the last run forgot comes back. `network` is left as it is. Raises InputError
-    for a share that is not between 0 and 1, and ModelError for an artifact that is another network.
+    for a share that is not between 0 and 1, and ModelError for an artifact that is another network or int8.
     """
     if not 0 < share < 1:
         raise InputError(f"a share of {share} averages nothing: it lies between 0 and 1")
+    if load_session(artifact, "cpu", 1)[1].precision == "int8":
+        raise ModelError(f"{artifact} has rounded weights: average with the float32 artifact that it was made from")
     ours, theirs = copy.deepcopy(network).double().eval().deployed(), network_of_artifact(artifact)
     if ours.description != theirs.description:
         raise ModelError(f"{artifact} is another network than the checkpoint's: their weights cannot be averaged")

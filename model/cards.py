@@ -8,6 +8,7 @@ from typing import Any
 
 from client.errors import ModelError
 from model.artifact_weights import averaging, refitting
+from model.held_out import gain_db
 from model.train import TrainConfig
 
 Card = dict[str, Any]
@@ -94,8 +95,9 @@ def _lines(name: str, scale: int, card: Card) -> list[str]:
         "|---|---|---|---|",
     ]
     for title, row in card["held_out"].items():
-        gain = row["psnr_y_db"] - row["bicubic_db"]
-        lines.append(f"| {title} | {row['bicubic_db']:.2f} | {row['psnr_y_db']:.2f} | {gain:+.2f} |")
+        bicubic, ours = ("identical" if row[name] is None else f"{row[name]:.2f}" for name in ("bicubic_db", "psnr_y_db"))
+        gain = gain_db(row)
+        lines.append(f"| {title} | {bicubic} | {ours} | {'undefined' if gain is None else f'{gain:+.2f}'} |")
     lines += [
         "",
         "An input `area` is the reference downscaled by area, `area@4000` the same through x264 at 4000 kbps (zerolatency).",

@@ -23,7 +23,7 @@ from client.upscaler import OnnxUpscaler
 from client.video import read_frames
 from model.artifact_weights import network_of_artifact
 from model.catalogue import NAMES
-from model.evaluate import evaluate, table
+from model.evaluate import evaluate, left_out, table
 from model.footage import Degradation, FootageCache, load_scenes
 from model.losses import LOSSES
 from model.stability import CASES, CLIP_FRAMES, HEADER, run_cases, table_row
@@ -254,11 +254,10 @@ def evaluate_main(argv: Sequence[str] | None = None) -> int:
         arguments.rows.parent.mkdir(parents=True, exist_ok=True)
         rows = evaluate(
             scenes,
-            FootageCache(arguments.cache),
+            FootageCache(arguments.cache, arguments.frames),
             models=arguments.models,
             scales=arguments.scales,
             degradations=degradations,
-            frames=arguments.frames,
             provider=arguments.provider,
             threads=arguments.threads,
             store=arguments.rows,
@@ -271,6 +270,8 @@ def evaluate_main(argv: Sequence[str] | None = None) -> int:
                 print(json.dumps(row), flush=True)
         if not measured:
             raise InputError(f"no scene of {arguments.footage} was rendered for {' or '.join(arguments.degradations)}")
+        for sentence in left_out(measured, scenes, degradations, arguments.frames):
+            print(f"{parser.prog}: {sentence}", file=sys.stderr)
         if not arguments.json:
             print(table(measured))
 

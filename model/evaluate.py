@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import json
 import os
 import time
@@ -11,10 +13,12 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import av
 import onnxruntime
 
+from client.cores import machine_name
 from client.errors import InputError, ModelError
-from client.models import find_model
+from client.models import WEIGHTS, find_model
 from client.pipeline import upscale_stream
 from client.quality import QualityMeter
 from client.runtime import OPENVINO, openvino
@@ -22,7 +26,7 @@ from client.sink import NullSink
 from client.upscaler import OnnxUpscaler
 from client.video import Decoded
 from client.vmaf import why_unavailable
-from model.footage import Degradation, FootageCache, Pair, Scene, load_pairs
+from model.footage import Degradation, FootageCache, Pair, Scene, check_films, load_pairs
 
 Row = dict[str, Any]
 _KEY = ("clip", "footage", "scale", "model", "sha256", "frames", "provider", "versions")
@@ -36,7 +40,6 @@ def evaluate(
     models: Sequence[str],
     scales: Sequence[int],
     degradations: Sequence[Degradation],
-    frames: int,
     provider: str = "cpu",
     threads: int | None,
     store: Path,
@@ -48,56 +51,79 @@ def evaluate(
     Speed is not measured here but by gamesr-bench, so rows may be made while something else runs. A row is known by clip,
     its footage's digest, scale, number of frames, provider, the artifact's digest and the versions of what computes and measures;
     what its card says of parameters and multiply-accumulates stands in the row too. A last row that was not written to its end,
-    by a run that was killed, is cut off. Raises what reading footage and models raises.
+    by a run that was killed, is cut off. Raises what reading footage and models raises, most of it before any measuring.
     """
     known = _read_rows(store)
-    upscalers = {scale: _upscalers([find_model(name, scale) for name in models], provider, threads) for scale in scales}
+    upscalers = {scale: _upscalers(models, scale, provider, threads) for scale in scales}
+    check_films(scenes, cache, scales, degradations)
     for scale in scales:
         for takes in load_pairs(scenes, cache, scale, degradations):
             for pair in takes:
                 for upscaler in upscalers[scale]:
                     spec = upscaler.spec
-                    values = pair.title, pair.low.digest, scale, spec.name, spec.sha256, min(frames, len(pair)), provider
+                    values = pair.title, pair.low.digest, scale, spec.name, spec.sha256, len(pair), provider
                     key = dict(zip(_KEY, (*values, _versions(pair, provider)), strict=True))
                     row = known.get(json.dumps(key))
                     if row is None:
-                        row = {**key, **_measure(pair, upscaler, frames)}
+                        row = {**key, **_measure(pair, upscaler)}
                         with store.open("a") as file:
                             file.write(json.dumps(row) + "\n")
                     yield {**row, "parameters": spec.card.get("parameters"), "macs_540p": spec.card.get("macs_540p")}
 
 
-def _upscalers(paths: Sequence[Path], provider: str, threads: int | None) -> list[OnnxUpscaler]:
-    """Each artifact once; raises ModelError for two of one name."""
+def left_out(rows: Iterable[Row], scenes: Sequence[Scene], degradations: Sequence[Degradation], frames: int) -> Iterator[str]:
+    """What of all that was asked for the rows do not have, in sentences."""
+    for title, count in {row["clip"].split()[0]: row["frames"] for row in rows if row["frames"] < frames}.items():
+        yield f"{title} has {count} frames only, of the {frames} that were asked for"
+    for degradation in dict.fromkeys(degradations):
+        titles = [scene.title for scene in scenes if not degradation.fits(scene)]
+        if titles:
+            yield f"{', '.join(titles)} was left out of {degradation}, for which it was not rendered"
+
+
+def _upscalers(models: Sequence[str], scale: int, provider: str, threads: int | None) -> list[OnnxUpscaler]:
+    """Each artifact once; raises ModelError for one of another scale and for two of one name."""
     by_name: dict[str, tuple[Path, OnnxUpscaler]] = {}
-    for path in paths:
+    for path in (find_model(model, scale) for model in models):
         upscaler = OnnxUpscaler(path, provider=provider, threads=threads)
         name, sha256 = upscaler.spec.name, upscaler.spec.sha256
+        if upscaler.spec.scale != scale:
+            raise ModelError(f"{path} upscales by {upscaler.spec.scale} and not by {scale}: measure it at its own scale alone")
         other, known = by_name.setdefault(name, (path, upscaler))
         if known.spec.sha256 != sha256:
             raise ModelError(f"{other} and {path} are different models of one name, {name!r}: export one of them under another")
     return [upscaler for _, upscaler in by_name.values()]
 
 
-def _measure(pair: Pair, upscaler: OnnxUpscaler, frames: int) -> Row:
+def _measure(pair: Pair, upscaler: OnnxUpscaler) -> Row:
     with QualityMeter(pair.high.width, pair.high.height) as meter:
-        for index, done in enumerate(upscale_stream(_decoded(pair, frames), upscaler, NullSink())):
+        for index, done in enumerate(upscale_stream(_decoded(pair), upscaler, NullSink())):
             meter.add(pair.high.frame(index), done.picture)
         return meter.result().record()
 
 
-def _decoded(pair: Pair, frames: int) -> Iterator[Decoded]:
-    for index in range(min(frames, len(pair))):
+def _decoded(pair: Pair) -> Iterator[Decoded]:
+    for index in range(len(pair)):
         now = time.perf_counter_ns()
         yield Decoded(pair.low.frame(index), now, now)
 
 
 def _versions(pair: Pair, provider: str) -> dict[str, str]:
     """What decides a figure beside its inputs: a row of other versions, or of a time without VMAF, is measured again."""
-    versions = {"onnxruntime": onnxruntime.__version__}
+    versions = {"gamesr": _code(), "av": av.__version__, "onnxruntime": onnxruntime.__version__}
+    versions["machine"] = machine_name()  # what it can multiply decides how runtimes round, and whether sums in 8 bits are cut off
     if provider in OPENVINO:
         versions["openvino"] = openvino().__version__
     return versions | {"vmaf": why_unavailable(pair.high.width, pair.high.height) or f"imageio-ffmpeg {version('imageio-ffmpeg')}"}
+
+
+@functools.cache
+def _code() -> str:
+    """A digest of the sources between an artifact and its figures: nobody has to remember to raise a version."""
+    digest = hashlib.sha256()
+    for path in (*sorted(WEIGHTS.parent.glob("*.py")), Path(__file__)):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def _read_rows(store: Path) -> dict[str, Row]:

@@ -1,4 +1,4 @@
-"""Game footage for training: scenes split by map or track, degraded as a cloud server degrades them, cut into clips.
+"""Game footage for training: scenes split by map or track, degraded as a cloud server degrades them.
 
 A footage list is a TOML file; paths are relative to it:
 
@@ -21,22 +21,22 @@ import json
 import os
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import chain, islice, product
 from pathlib import Path
+from typing import BinaryIO
 
+import av
 import numpy as np
 from numpy.typing import NDArray
 
 from client.cloud import CloudSettings, area_downscale, through_codec
 from client.errors import InputError
 from client.frames import Frame
-from client.video import VideoSource
-from client.whole_frames import whole_frames
+from model.films import Film
 
 CACHE_VERSION = 1
-CROP_CANDIDATES = 8
 MAX_FPS = 1000
 
 
@@ -56,20 +56,25 @@ class Scene:
     def title(self) -> str:
         return f"{self.game}/{self.name}"
 
+    @property
+    def films(self) -> list[Path]:
+        return [self.reference, *self.native.values(), *([self.antialiased] if self.antialiased else [])]
+
 
 def load_scenes(footage: Path, *, split: str, games: Iterable[str] = ()) -> list[Scene]:
     """The scenes of one split, of the given games or of all; raises InputError when the list is unreadable or nothing is left."""
     try:
         rows = tomllib.loads(footage.read_text())["scene"]
         scenes = [_scene(row, footage.parent) for row in rows]
+        films = [(path.resolve(), scene.split) for scene in scenes for path in scene.films]
     except OSError as error:
         raise InputError(f"{footage} cannot be read: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, RuntimeError) as error:  # the last of what has no end: brackets, links
         raise InputError(f"{footage} is not a footage list: {error}") from error
-    by_name: dict[str, str] = {}
-    for scene in scenes:
-        if by_name.setdefault(scene.title, scene.split) != scene.split:
-            raise InputError(f"{footage}: {scene.title} is in two splits; a map or track belongs to one")
+    split_of: dict[object, str] = {}
+    for what, of in [*((scene.title, scene.split) for scene in scenes), *films]:
+        if split_of.setdefault(what, of) != of:
+            raise InputError(f"{footage}: {what} is in two splits; a map or track, and what is filmed of it, belongs to one")
     wanted = set(games) or {scene.game for scene in scenes}
     chosen = [scene for scene in scenes if scene.split == split and scene.game in wanted]
     if not chosen:
@@ -159,79 +164,103 @@ class Take:
 
 
 class FootageCache:
-    """Decodes and degrades every scene once, or its first `frames`, into a folder that may be deleted at any time."""
+    """Decodes and degrades every scene once, or its first `frames`, into a folder that may be deleted at any time.
+
+    Its films are looked at once, and raise what `Film.of` raises.
+    """
 
     def __init__(self, folder: Path, frames: int | None = None) -> None:
         self.folder, self.frames = folder, frames
+        self._films: dict[tuple[Path, int], Film] = {}
         folder.mkdir(parents=True, exist_ok=True)
 
     def reference(self, scene: Scene, *, antialiased: bool = False) -> Take:
         """The scene as it should become; raises InputError when an anti-aliased one is wanted and there is none."""
-        path = _target(scene, antialiased)
-        return self._take({"file": _digest(path)}, lambda: _film(path))
+        film = self._target(scene, antialiased)
+        return self._take({"file": film.digest}, film.frames)
+
+    def films(self, scene: Scene, scale: int, degradation: Degradation) -> tuple[Film, Film | None]:
+        """What the scene should become, and the native render of it that is wanted, if one is.
+
+        Raises InputError where there is none, or the two are not the same pictures in two sizes.
+        """
+        target = self._target(scene, degradation.antialiased)
+        target.check_scale(scale)
+        if degradation.source != "native":
+            return target, None
+        height = target.height // scale
+        if height not in scene.native:
+            raise InputError(f"{scene.title} has no native {height}p render")
+        render = self._film(scene.native[height], scene.fps)
+        target.check_render(render, scale)
+        return target, render
 
     def degraded(self, scene: Scene, scale: int, degradation: Degradation) -> Take:
-        """The scene at 1/scale; raises InputError when a native render is wanted and there is none of that size."""
+        """The scene at 1/scale, frame for frame its reference; raises InputError when that cannot be had."""
+        target, render = self.films(scene, scale, degradation)
         reference = self.reference(scene, antialiased=degradation.antialiased)
-        digest = _digest(_target(scene, degradation.antialiased))
-        key: dict[str, object] = {"file": digest, "scale": scale, "source": degradation.source}
-        if degradation.source == "native":
-            height = reference.height // scale
-            if height not in scene.native:
-                raise InputError(f"{scene.title} has no native {height}p render")
-            key["native"] = _digest(scene.native[height])
+        key: dict[str, object] = {"file": target.digest, "scale": scale, "source": degradation.source}
+        if render:
+            key["native"] = render.digest
         settings = None
         if degradation.bitrate_kbps:
             settings = CloudSettings(degradation.bitrate_kbps, scene.fps)
-            key["encoder"] = settings.record()
+            key |= {"encoder": settings.record(), "av": av.__version__}  # which brings x264
 
         def frames() -> Iterator[Frame]:
-            if degradation.source == "native":
-                small: Iterator[Frame] = islice(_film(scene.native[reference.height // scale]), len(reference))
-            else:
-                small = (area_downscale(reference.frame(i), scale) for i in range(len(reference)))
-            return small if settings is None else through_codec(small, settings)
+            small = render.frames() if render else (area_downscale(reference.frame(i), scale) for i in range(len(reference)))
+            try:
+                yield from small if settings is None else through_codec(small, settings)
+            except av.FFmpegError as error:
+                raise InputError(f"{scene.title} cannot be encoded as {degradation} by {scale}: {error.strerror}") from error
 
         return self._take(key, frames)
 
-    def _take(self, key: dict[str, object], frames: Callable[[], Iterable[Frame]]) -> Take:
+    def _target(self, scene: Scene, antialiased: bool) -> Film:
+        path = scene.antialiased if antialiased else scene.reference
+        if path is None:
+            raise InputError(f"{scene.title} has no anti-aliased reference")
+        return self._film(path, scene.fps)
+
+    def _film(self, path: Path, fps: int) -> Film:
+        if (path, fps) not in self._films:
+            self._films[path, fps] = Film.of(path, fps)
+        return self._films[path, fps]
+
+    def _take(self, key: dict[str, object], frames: Callable[[], Iterator[Frame]]) -> Take:
         if self.frames is not None:
             key["frames"] = self.frames
         digest = hashlib.sha256(json.dumps([CACHE_VERSION, key], sort_keys=True).encode()).hexdigest()[:24]
         path = self.folder / f"{digest}.npy"
-        if not path.exists():
-            rows = [
-                np.concatenate([plane.reshape(-1) for plane in (f.y, f.u, f.v)]).reshape(-1, f.width) for f in islice(frames(), self.frames)
-            ]
-            if not rows:
-                raise InputError(f"no frames: {key}")
-            partial = path.with_suffix(f".{os.getpid()}.npy")
-            try:
-                np.save(partial, np.stack(rows))
-                partial.replace(path)
-            finally:
-                partial.unlink(missing_ok=True)
-        return Take(np.load(path, mmap_mode="c"), digest)  # torch warns of arrays that it could not write to
+        try:
+            data = np.load(path, mmap_mode="c")  # torch warns of arrays that it could not write to
+        except (FileNotFoundError, EOFError, ValueError):  # the last two of a file that was cut off
+            _write(path, islice(frames(), self.frames))
+            data = np.load(path, mmap_mode="c")
+        return Take(data, digest)
 
 
-def _film(path: Path) -> Iterator[Frame]:
-    with VideoSource(path) as source:
-        yield from whole_frames(source)
-
-
-def _target(scene: Scene, antialiased: bool) -> Path:
-    path = scene.antialiased if antialiased else scene.reference
-    if path is None:
-        raise InputError(f"{scene.title} has no anti-aliased reference")
-    return path
-
-
-def _digest(path: Path) -> str:
+def _write(path: Path, frames: Iterator[Frame]) -> None:
+    """An .npy file of frames, written as they come: all of a film may be larger than memory."""
+    first = next(frames)
+    shape = first.height * 3 // 2, first.width
+    partial = path.with_suffix(f".{os.getpid()}.npy")
     try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
+        with partial.open("wb") as file:
+            _write_header(file, 0, shape)
+            count = 0
+            for frame in chain([first], frames):
+                file.write(b"".join(plane.tobytes() for plane in (frame.y, frame.u, frame.v)))
+                count += 1
+            file.seek(0)
+            _write_header(file, count, shape)  # of the same length: NumPy leaves room for any count
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _write_header(file: BinaryIO, count: int, shape: tuple[int, int]) -> None:
+    np.lib.format.write_array_header_1_0(file, {"descr": "|u1", "fortran_order": False, "shape": (count, *shape)})
 
 
 @dataclass(frozen=True)
@@ -246,9 +275,17 @@ class Pair:
         return min(len(self.low), len(self.high))
 
 
-def load_pairs(scenes: Iterable[Scene], cache: FootageCache, scale: int, degradations: Iterable[Degradation]) -> list[list[Pair]]:
+def check_films(scenes: Iterable[Scene], cache: FootageCache, scales: Iterable[int], degradations: Iterable[Degradation]) -> None:
+    """Raises InputError where a film of the scenes does not fit, before any is decoded."""
+    for scene, scale, degradation in product(scenes, scales, degradations):
+        if degradation.fits(scene):
+            cache.films(scene, scale, degradation)
+
+
+def load_pairs(scenes: Sequence[Scene], cache: FootageCache, scale: int, degradations: Iterable[Degradation]) -> list[list[Pair]]:
     """For each scene its degraded takes, those left out for which it was not rendered."""
     wanted = list(degradations)
+    check_films(scenes, cache, [scale], wanted)
     pairs = []
     for scene in scenes:
         takes = [d for d in wanted if d.fits(scene)]
@@ -256,51 +293,3 @@ def load_pairs(scenes: Iterable[Scene], cache: FootageCache, scale: int, degrada
             [Pair(f"{scene.title} {d}", cache.degraded(scene, scale, d), cache.reference(scene, antialiased=d.antialiased)) for d in takes]
         )
     return [takes for takes in pairs if takes]
-
-
-def by_game(pairs: list[list[Pair]]) -> list[list[list[Pair]]]:
-    """Scenes grouped by game, so that each game is drawn as often however many scenes it has."""
-    games: dict[str, list[list[Pair]]] = {}
-    for takes in pairs:
-        games.setdefault(takes[0].title.split("/")[0], []).append(takes)
-    return list(games.values())
-
-
-def sample_clips(
-    games: list[list[list[Pair]]], *, seed: int, index: int, batch: int, frames: int, patch: int, scale: int
-) -> tuple[list[NDArray[np.uint8]], list[NDArray[np.uint8]]]:
-    """Batch number `index` of a run: random crops of random clips of `by_game`, a pure function of its arguments.
-
-    Each crop is the one with the most fine detail of a few random ones: in flat areas there is nothing to learn (after 360
-    steps +0.71 dB over bicubic on a held-out map, where uniform crops reached +0.35). Nothing is mirrored: left-sited chroma
-    would become right-sited, and no game is played in a mirror.
-
-    Gives low and high planes [y, u, v], uint8 (batch, frames, 1, patch, patch) for low luma, `scale` times that for high.
-    """
-    rng = np.random.default_rng([seed, index])
-    low: list[list[NDArray[np.uint8]]] = [[], [], []]
-    high: list[list[NDArray[np.uint8]]] = [[], [], []]
-    for _ in range(batch):
-        scenes = games[rng.integers(len(games))]
-        takes = scenes[rng.integers(len(scenes))]
-        pair = takes[rng.integers(len(takes))]
-        first = int(rng.integers(len(pair) - frames + 1))
-        top, left = _busiest_crop(pair.low.planes()[0][first], patch, rng)
-        for planes, take, factor in ((low, pair.low, 1), (high, pair.high, scale)):
-            for out, plane, sub in zip(planes, take.planes(), (1, 2, 2), strict=True):
-                y, x, side = top * factor // sub, left * factor // sub, patch * factor // sub
-                out.append(plane[first : first + frames, y : y + side, x : x + side])
-    return [np.stack(p)[:, :, None] for p in low], [np.stack(p)[:, :, None] for p in high]
-
-
-def _busiest_crop(luma: NDArray[np.uint8], patch: int, rng: np.random.Generator) -> tuple[int, int]:
-    """Top and left, both even, of the one of `CROP_CANDIDATES` random crops whose second differences are largest."""
-    height, width = luma.shape
-    crops = []
-    for _ in range(CROP_CANDIDATES):
-        top, left = (2 * int(rng.integers((side - patch) // 2 + 1)) for side in (height, width))
-        crop = luma[top : top + patch, left : left + patch].astype(np.int16)
-        detail = np.abs(np.diff(crop, 2, 0)).mean() + np.abs(np.diff(crop, 2, 1)).mean()
-        crops.append((float(detail), top, left))
-    _, top, left = max(crops)
-    return top, left

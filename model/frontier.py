@@ -20,14 +20,14 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from tqdm import tqdm
 
 from client.command import command_parser, run_command, whole_number
-from client.errors import InputError
+from client.errors import InputError, OutputError
 from client.measurement import WARM_UP_FRAMES, Task, measure_in_fresh_process
 from client.models import find_model
 from client.runtime import PROVIDERS
 from client.synthetic import write_synthetic_clip
 from client.whole_file import write_whole
-from model.evaluate import Row, evaluate
-from model.footage import Degradation, FootageCache, load_scenes
+from model.evaluate import Row, evaluate, left_out
+from model.footage import Degradation, FootageCache, Scene, load_scenes
 
 PROGRAM = "gamesr-frontier"
 EPILOG = """\
@@ -133,7 +133,7 @@ def drawing(candidates: Sequence[Candidate]) -> bytes:
 
     A marker a runtime; a model's runtimes are joined, and the fastest bears its name, slanted, for tiers lie close together.
     """
-    markers = dict(zip(dict.fromkeys(c.provider for c in candidates), "so^Dv", strict=False))
+    markers = dict(zip(dict.fromkeys(c.provider for c in candidates), "so^DvP", strict=False))
     inputs = list(candidates[0].gains)
     with mpl.rc_context(
         {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "svg.hashsalt": "gamesr", "svg.fonttype": "none"}
@@ -172,12 +172,16 @@ def drawing(candidates: Sequence[Candidate]) -> bytes:
 def measure(arguments: argparse.Namespace) -> list[Candidate]:
     """Every model on every runtime; raises GamesrError."""
     names = list(dict.fromkeys([YARDSTICK, *arguments.models]))
+    scenes = load_scenes(arguments.footage, split="test")
+    degradations = [Degradation.parse(text) for text in arguments.degradations]
     rows: list[Row] = []
     for provider in dict.fromkeys([YARDSTICK_PROVIDER, *arguments.providers]):
         models = names if provider in arguments.providers else [YARDSTICK]
-        rows += tqdm(_rows(models, provider, arguments), desc=provider, unit="row", disable=not sys.stderr.isatty())
+        rows += tqdm(_rows(scenes, degradations, models, provider, arguments), desc=provider, unit="row", disable=not sys.stderr.isatty())
     if not rows:
         raise InputError(f"no scene of {arguments.footage} was rendered for {' or '.join(arguments.degradations)}")
+    for sentence in left_out(rows, scenes, degradations, arguments.frames):
+        print(f"{PROGRAM}: {sentence}", file=sys.stderr)
     gains = gains_over_bicubic(rows)
     candidates = []
     for (provider, model), (p50_ms, p95_ms) in _latencies(names, arguments).items():
@@ -208,15 +212,16 @@ def _latencies(names: Sequence[str], arguments: argparse.Namespace) -> dict[tupl
     return {key: (median(p50 for p50, _ in of), median(p95 for _, p95 in of)) for key, of in runs.items()}
 
 
-def _rows(names: Sequence[str], provider: str, arguments: argparse.Namespace) -> Iterator[Row]:
+def _rows(
+    scenes: Sequence[Scene], degradations: Sequence[Degradation], names: Sequence[str], provider: str, arguments: argparse.Namespace
+) -> Iterator[Row]:
     arguments.rows.parent.mkdir(parents=True, exist_ok=True)
     return evaluate(
-        load_scenes(arguments.footage, split="test", games=[]),
-        FootageCache(arguments.cache),
+        scenes,
+        FootageCache(arguments.cache, arguments.frames),
         models=names,
         scales=[arguments.scale],
-        degradations=[Degradation.parse(text) for text in arguments.degradations],
-        frames=arguments.frames,
+        degradations=degradations,
         provider=provider,
         threads=arguments.threads,
         store=arguments.rows,
@@ -259,13 +264,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = command.parse_args(argv)
 
     def work() -> None:
+        if arguments.svg and not arguments.svg.parent.is_dir():
+            raise OutputError(f"{arguments.svg.parent} is not a folder: make it, or name another with --svg")
         candidates = measure(arguments)
-        if arguments.svg:
-            write_whole(arguments.svg, drawing(candidates))
         for candidate in candidates if arguments.json else ():
             print(json.dumps(asdict(candidate)))
         for degradation in () if arguments.json else candidates[0].gains:
             print(f"Input {degradation}:\n\n{table(candidates, degradation)}\n")
+        if arguments.svg:
+            write_whole(arguments.svg, drawing(candidates))
 
     return run_command(
         PROGRAM, work, debug=arguments.debug, interrupted=f"stopped; the same command goes on from the rows in {arguments.rows}"

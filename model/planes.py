@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple, Self
 
+import numpy as np
+import torch
 from torch import Tensor, nn
 
 from model.reparam import fuse, load_fused
@@ -27,6 +29,11 @@ class Planes(NamedTuple):
 
     def unflatten_time(self, batch: int) -> Planes:
         return Planes(*(plane.reshape(batch, -1, *plane.shape[1:]) for plane in self))
+
+
+def to_planes(arrays: list[np.ndarray], device: torch.device) -> Planes:
+    """uint8 arrays [y, u, v] as float planes of code values."""
+    return Planes(*(torch.from_numpy(a).to(device, torch.float32) for a in arrays))
 
 
 class State(NamedTuple):

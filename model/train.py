@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import time
@@ -18,16 +19,19 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-from client.errors import InputError, ModelError
+from client.errors import InputError, ModelError, ProviderError
 from model.artifact_weights import run_of_artifact
-from model.catalogue import NAMES, described_network, network_of_preset
-from model.footage import Degradation, FootageCache, Pair, by_game, load_pairs, load_scenes, sample_clips
+from model.catalogue import NAMES, network_of_preset
+from model.footage import Degradation, FootageCache, load_pairs, load_scenes
+from model.held_out import gain_db, psnr_y_beside_bicubic
 from model.lean import Lean
 from model.losses import LOSSES, charbonnier, mean_log_mse
-from model.planes import Network, Planes, State
+from model.planes import Network, Planes, State, to_planes
 from model.rounding import RoundedFeatures
+from model.sampling import by_game, sample_clips
 
 CHECKPOINT_FORMAT = 1
+SAVED = ("config", "footage", "before", "commit", "device", "network", "optimizer", "step", "seconds", "held_out")
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,8 @@ class TrainConfig:
             raise InputError(f"no loss is called {self.loss!r}: there are {', '.join(LOSSES)}")
         if self.frames % self.window or self.patch % 2:
             raise InputError("the clip length must be a multiple of the window, and the patch even")
+        if not (math.isfinite(self.learning_rate) and self.learning_rate > 0):
+            raise InputError(f"the learning rate is a number above 0, not {self.learning_rate}")
 
     def network(self) -> Network:
         """The untrained network."""
@@ -78,18 +84,13 @@ class TrainConfig:
         return self.learning_rate * warm * 0.5 ** int((self.halvings + 1) * step / self.steps)
 
 
-def to_planes(arrays: list[np.ndarray], device: torch.device) -> Planes:
-    """uint8 arrays [y, u, v] as float planes of code values."""
-    return Planes(*(torch.from_numpy(a).to(device, torch.float32) for a in arrays))
-
-
 class Trainer:
     """One run in one folder: `checkpoint.pt` (whole or not there) and `log.jsonl`."""
 
     def __init__(
         self, config: TrainConfig, footage: Path, cache: FootageCache, folder: Path, *, device: str = "cpu", compiled: bool = False
     ):
-        self.folder, self.config, self.device = folder, config, torch.device(device)
+        self.folder, self.config, self.device = folder, config, _device(device)
         degradations = [Degradation.parse(text) for text in config.degradations]
         self.train = load_pairs(load_scenes(footage, split="train", games=config.games), cache, config.scale, degradations)
         held_out = load_scenes(footage, split="validate", games=config.games)
@@ -108,13 +109,10 @@ class Trainer:
         self.network = config.network().to(self.device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.before: list[dict[str, Any]] = []  # the runs that this one builds on, oldest first
-        if config.initial_weights:
-            self._start_from(Path(config.initial_weights))
-        folder.mkdir(parents=True, exist_ok=True)
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), config.learning_rate, betas=(0.9, 0.999), weight_decay=config.weight_decay
         )
-        self.rounded = RoundedFeatures(self.network) if config.int8 else None
+        self.rounded = RoundedFeatures(self.network, config.seed) if config.int8 else None
         self.forward: Any = torch.compile(self.network) if compiled else self.network
         self.footage = {
             split: [f"{pair.title.split()[0]} ({len(pair)} frames)" for pair in (takes[0] for takes in pairs)]
@@ -123,18 +121,28 @@ class Trainer:
         self.commit = source_commit()
         self.step = 0
         self.seconds = 0.0
-        self.held_out: dict[str, dict[str, float]] = {}
+        self.held_out: dict[str, dict[str, float | None]] = {}
         if (folder / "checkpoint.pt").exists():
-            self._resume()
+            self._resume(folder / "checkpoint.pt")  # whatever has become of what it started from
+        elif config.initial_weights:
+            self._start_from(Path(config.initial_weights))
+        folder.mkdir(parents=True, exist_ok=True)
 
-    def _resume(self) -> None:
-        saved = load_checkpoint(self.folder / "checkpoint.pt")
-        if saved["config"] != asdict(self.config):
-            different = [k for k, v in asdict(self.config).items() if saved["config"].get(k) != v]
-            raise InputError(f"{self.folder} holds a run of another configuration ({', '.join(different)}): choose another folder")
-        self.network.load_state_dict(saved["network"])
-        self.optimizer.load_state_dict(saved["optimizer"])
-        self.step, self.seconds, self.held_out = saved["step"], saved["seconds"], saved["held_out"]
+    def _resume(self, path: Path) -> None:
+        saved = load_checkpoint(path)
+        for what, theirs, ours in (
+            ("another configuration", saved["config"], asdict(self.config)),
+            ("other footage", saved["footage"], self.footage),
+        ):
+            different = [k for k, v in ours.items() if theirs.get(k) != v]
+            if different:
+                raise InputError(f"{self.folder} holds a run of {what} ({', '.join(different)}): choose another folder")
+        try:
+            self.network.load_state_dict(saved["network"])
+            self.optimizer.load_state_dict(saved["optimizer"])
+        except (KeyError, RuntimeError, TypeError, ValueError) as error:
+            raise ModelError(f"{path} has other weights than a run of its own configuration") from error
+        self.step, self.seconds, self.held_out, self.before = (saved[name] for name in ("step", "seconds", "held_out", "before"))
 
     def _start_from(self, path: Path) -> None:
         """Take over every weight of the same name and shape; a network of another scale keeps its own head and base.
@@ -221,7 +229,7 @@ class Trainer:
             raise ModelError(f"the loss is {value} at step {self.step}: lower the learning rate")
         return value, state if state is None else State(*(t.detach() for t in state))
 
-    def validation(self, frames: int = 5) -> dict[str, dict[str, float]]:
+    def validation(self, frames: int = 5) -> dict[str, dict[str, float | None]]:
         """PSNR-Y of the network and of bicubic in dB on the first frames of every held-out take, full size, state carried."""
         return {pair.title: psnr_y_beside_bicubic(self.network, pair, frames) for takes in self.validate for pair in takes}
 
@@ -240,12 +248,21 @@ class Trainer:
                 if done or (self.step % per_clip == 0 and self.step // per_clip % max(1, validate_every // per_clip) == 0):
                     self.held_out = self.validation()
                     self.save()
-                    gains = [r["psnr_y_db"] - r["bicubic_db"] for r in self.held_out.values()]
-                    gain = f"held-out PSNR-Y over bicubic {fmean(gains):+.2f} dB"
+                    gains = [db for row in self.held_out.values() if (db := gain_db(row)) is not None]
+                    gain = f"held-out PSNR-Y over bicubic {fmean(gains):+.2f} dB" if gains else ""
                     row = {"step": self.step, "loss": fmean(recent), "train_s": round(self.seconds, 1), "held_out": self.held_out}
                     log.write(json.dumps(row) + "\n")
                     log.flush()
                     recent.clear()
+
+
+def _device(name: str) -> torch.device:
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device).item()
+    except (AssertionError, RuntimeError) as error:
+        raise ProviderError(f"torch cannot compute on the device {name!r}: {str(error).splitlines()[0]}") from error
+    return device
 
 
 def source_commit() -> str:
@@ -267,29 +284,21 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         raise ModelError(f"{path} is not a checkpoint: {error}") from error
     if not isinstance(saved, dict) or saved.get("format") != CHECKPOINT_FORMAT:
         raise ModelError(f"{path} is not a checkpoint of format {CHECKPOINT_FORMAT}")
+    missing = [name for name in SAVED if name not in saved]
+    if missing:
+        raise ModelError(f"{path} is not a whole checkpoint: it lacks {', '.join(missing)}")
+    try:
+        saved["config"] = asdict(TrainConfig(**saved["config"]))  # what an older version did not know was the default
+    except (InputError, TypeError) as error:
+        raise ModelError(f"{path} is of a configuration that this version does not know: {error}") from error
     return saved
 
 
 def network_of(checkpoint: dict[str, Any]) -> Network:
     """The network in training form with a checkpoint's weights."""
     network = TrainConfig(**checkpoint["config"]).network()
-    network.load_state_dict(checkpoint["network"])
+    try:
+        network.load_state_dict(checkpoint["network"])
+    except (RuntimeError, TypeError) as error:
+        raise ModelError("the checkpoint has other weights than the network of its configuration") from error
     return network
-
-
-@torch.no_grad()
-def psnr_y_beside_bicubic(network: Network, pair: Pair, frames: int) -> dict[str, float]:
-    """PSNR-Y in dB from the mean MSE of rounded luma over the first frames, for the network and for bicubic interpolation."""
-    device = network.weight.device
-    bicubic = described_network({"scale": network.scale, "blocks": 0, "recurrent": False}).to(device)  # untrained, it is that
-    low, high = ([plane[:frames, None, None] for plane in take.planes()] for take in (pair.low, pair.high))
-    state = network.initial_state(1, pair.low.height, pair.low.width)
-    errors = np.zeros(2)
-    count = min(frames, len(pair))
-    for t in range(count):
-        frame, target = to_planes([p[t] for p in low], device), torch.from_numpy(high[0][t]).to(device, torch.float32)
-        ours, state = network.step(frame, state)
-        base, _ = bicubic.step(frame, None)
-        errors += [float((picture.y.round().clamp(0, 255) - target).square().mean()) for picture in (ours, base)]
-    ours_db, bicubic_db = 10 * np.log10(255**2 * count / errors)
-    return {"psnr_y_db": float(ours_db), "bicubic_db": float(bicubic_db)}

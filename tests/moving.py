@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from fractions import Fraction
 from pathlib import Path
 
@@ -21,22 +22,29 @@ def picture(t: int, height: int = 96, width: int = 144) -> Frame:
 
 
 def write_footage(folder: Path) -> Path:
-    """A footage list of five scenes of two games, all of them one clip of 12 frames, 144x96; the first has a native 48p render."""
-    _write_clip(folder / "clip.mkv", 96, 144)
-    _write_clip(folder / "native.mkv", 48, 72)
-    scene = '[[scene]]\nname = "{}"\ngame = "{}"\nsplit = "{}"\nfps = 30\nreference = "clip.mkv"\n'
+    """A footage list of five scenes of two games, all of them the same 12 frames, 144x96; the first has a native 48p render."""
+    write_clip(folder / "clip.mkv", 96, 144)
+    write_clip(folder / "native.mkv", 48, 72)
+    films = {"train": "clip.mkv", "validate": "validate.mkv", "test": "test.mkv"}
+    for film in ("validate.mkv", "test.mkv"):
+        shutil.copy(folder / "clip.mkv", folder / film)
     rows = [("one", "a", "train"), ("two", "b", "train"), ("three", "b", "train"), ("four", "a", "validate"), ("five", "a", "test")]
-    scenes = [scene.format(*row) for row in rows]
+    scenes = [scene(name, game, split, films[split]) for name, game, split in rows]
     scenes[0] += 'native = { 48 = "native.mkv" }\n'
     (folder / "footage.toml").write_text("\n".join(scenes))
     return folder / "footage.toml"
 
 
-def _write_clip(path: Path, height: int, width: int) -> None:
+def scene(name: str, game: str, split: str, film: str, fps: int = 30) -> str:
+    """A table of a footage list."""
+    return f'[[scene]]\nname = "{name}"\ngame = "{game}"\nsplit = "{split}"\nfps = {fps}\nreference = "{film}"\n'
+
+
+def write_clip(path: Path, height: int, width: int, frames: int = 12) -> None:
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=30, options={"qp": "4", "preset": "ultrafast"})
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        for t in range(12):
+        for t in range(frames):
             frame = to_av_frame(picture(t, height, width))
             frame.pts, frame.time_base = t, Fraction(1, 30)
             container.mux(stream.encode(frame))

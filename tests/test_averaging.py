@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from client.errors import InputError, ModelError
+from client.models import find_model
 from model.artifact_weights import network_of_artifact
 from model.averaging import averaged
 from model.export import export_network
@@ -34,6 +35,13 @@ def test_what_runs_lies_between_the_two(tmp_path: Path, preset: str) -> None:
         torch.testing.assert_close(found[name], expected, rtol=tolerance, atol=tolerance, msg=name)
         moved += not torch.allclose(weight, expected, rtol=1e-3, atol=1e-3)
     assert moved > 3
+
+
+def test_rounded_weights_are_not_averaged_under_their_name() -> None:
+    """What network_of_artifact gives are those of the float32 artifact that it was made from."""
+    artifact = find_model("fast-int8", 2)
+    with pytest.raises(ModelError, match="has rounded weights: average with the float32 artifact that it was made from"):
+        averaged(random_network("fast", 2), artifact, 0.5)
 
 
 def test_nothing_else_is_averaged(tmp_path: Path) -> None:

@@ -14,9 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from client.measurement import Task
+from client.runtime import PROVIDERS
 from client.timing import LatencySummary
 from client.upscaler import OnnxUpscaler
-from model.frontier import PROGRAM, frontier, gains_over_bicubic, main
+from model.frontier import PROGRAM, Candidate, Gains, drawing, frontier, gains_over_bicubic, main
 
 POINTS = st.lists(st.tuples(st.integers(1, 9), st.integers(-9, 9)), min_size=1, max_size=12)
 
@@ -170,6 +171,40 @@ def test_no_scene_that_was_rendered_for_it_is_said_before_anything_is_timed(
     command = [str(footage), "--degradations", "native", "native:aa", "--rows", str(tmp_path / "rows"), "--cache", str(tmp_path / "cache")]
     assert main(command) == 1
     assert capsys.readouterr().err == f"{PROGRAM}: no scene of {footage} was rendered for native or native:aa\n"
+
+
+def test_a_drawing_that_cannot_be_written_is_said_first_and_costs_no_table(
+    footage: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], taking: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taking.update(bicubic=1.0)
+    command = [str(footage), "--models", "bicubic", "--degradations", "area", "--frames", "2", "--threads", "1"]
+    command += ["--rows", str(tmp_path / "rows.jsonl"), "--cache", str(tmp_path / "cache")]
+    assert main([*command, "--svg", str(tmp_path / "nowhere" / "frontier.svg")]) == 1
+    assert capsys.readouterr().err == f"{PROGRAM}: {tmp_path / 'nowhere'} is not a folder: make it, or name another with --svg\n"
+    assert not (tmp_path / "rows.jsonl").exists()
+    (tmp_path / "folder.svg").mkdir()
+    assert main([*command, "--svg", str(tmp_path / "folder.svg")]) == 1
+    said = capsys.readouterr()
+    assert "| **bicubic** |" in said.out and "cannot write" in said.err
+
+
+def test_every_runtime_has_a_marker() -> None:
+    candidates = [
+        Candidate("ours", provider, None, None, ms, ms, {"area": Gains({"a": 1.0 * ms}, 0, None, True)})
+        for ms, provider in enumerate(PROVIDERS, 1)
+    ]
+    words = "".join(ElementTree.fromstring(drawing(candidates)).itertext())
+    assert all(provider in words for provider in PROVIDERS)
+
+
+def test_what_is_not_measured_is_said(footage: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], taking: dict[str, float]) -> None:
+    taking.update(bicubic=1.0)
+    command = [str(footage), "--models", "bicubic", "--degradations", "area", "native", "--frames", "8", "--threads", "1"]
+    assert main([*command, "--rows", str(tmp_path / "rows.jsonl"), "--cache", str(tmp_path / "cache"), "--json"]) == 0
+    assert capsys.readouterr().err.splitlines() == [
+        f"{PROGRAM}: made/one has 6 frames only, of the 8 that were asked for",
+        f"{PROGRAM}: made/one was left out of native, for which it was not rendered",
+    ]
 
 
 def test_what_cannot_be_done_is_said_in_a_sentence(footage: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

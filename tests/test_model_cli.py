@@ -165,8 +165,8 @@ def test_evaluate_knows_a_row_by_its_footage_and_not_by_the_scenes_name(
     again = ["--cache", str(tmp_path / "cache"), "--rows", str(tmp_path / "rows.jsonl"), "--models", "bicubic", "--scales", "2", "--json"]
     found = []
     footage = write_footage(tmp_path)
-    for film in ("clip.mkv", "native.mkv"):
-        (tmp_path / film).replace(tmp_path / "clip.mkv")
+    for film in ("test.mkv", "native.mkv"):
+        (tmp_path / film).replace(tmp_path / "test.mkv")
         assert evaluate_main([str(footage), "--degradations", "area", "--frames", "4", *again]) == 0
         found.append(json.loads(capsys.readouterr().out))
     assert found[0]["clip"] == found[1]["clip"] and found[0]["psnr_y_db"] != found[1]["psnr_y_db"]
@@ -192,7 +192,7 @@ def test_a_row_of_other_versions_is_measured_again(measured: list[str], tmp_path
     for _ in range(2):
         assert evaluate_main([*measured, "--provider", "openvino"]) == 0
     before, second, third, fourth = map(json.loads, rows.read_text().splitlines())
-    assert "versions" not in before and second == first and set(first["versions"]) == {"onnxruntime", "vmaf"}
+    assert "versions" not in before and second == first and set(first["versions"]) == {"gamesr", "av", "onnxruntime", "machine", "vmaf"}
     assert third["versions"] == first["versions"] | {"onnxruntime": "0"}
     assert fourth["versions"]["vmaf"] == "no VMAF here" and fourth["versions"]["openvino"]
 

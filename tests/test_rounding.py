@@ -39,7 +39,7 @@ def features_of(network: Lean, clip: Planes) -> torch.Tensor:
 
 def test_an_error_is_at_most_half_a_step_of_the_channels_range_over_clip_and_made_frames(network: Lean) -> None:
     clip = Planes(*(plane.float() for plane in random_clip(1, 2, 16, 24)))
-    rounded = RoundedFeatures(network)
+    rounded = RoundedFeatures(network, 0)
     exact = features_of(network, clip)
     made = []
     for make, width, height in MADE:
@@ -55,23 +55,35 @@ def test_an_error_is_at_most_half_a_step_of_the_channels_range_over_clip_and_mad
     torch.testing.assert_close(features_of(network, clip), exact, rtol=0, atol=0)
 
 
-def test_in_a_flat_area_a_channel_is_off_by_the_same_everywhere_and_by_another_code_in_each_clip(network: Lean) -> None:
+def test_in_a_flat_area_a_channel_is_off_by_the_same_everywhere_and_by_another_code_in_each_step(network: Lean) -> None:
     grey = Planes(*(torch.full(shape, 128.0) for shape in ((1, 2, 1, 16, 24), (1, 2, 1, 8, 12), (1, 2, 1, 8, 12))))
-    exact, rounded = features_of(network, grey), RoundedFeatures(network)
+    exact, rounded = features_of(network, grey), RoundedFeatures(network, 0)
     errors = []
-    for _ in range(2):
-        with rounded(0):
+    for index in (0, MADE_FRAMES):  # with the same made frames
+        with rounded(index):
             errors.append(features_of(network, grey) - exact)
     for error in errors:
         torch.testing.assert_close(error, error[:1, :1, :, :1, :1].expand_as(error), rtol=0, atol=1e-6)
     assert (errors[0] - errors[1]).abs().amax() > 1e-4
 
 
+def test_where_the_codes_lie_is_a_function_of_seed_and_step(network: Lean) -> None:
+    """A run that is resumed draws what it would have drawn."""
+    clip = Planes(*(plane.float() for plane in random_clip(1, 1, 8, 8)))
+
+    def rounded(seed: int, index: int) -> torch.Tensor:
+        with RoundedFeatures(network, seed)(index):
+            return features_of(network, clip)
+
+    first = rounded(0, 3)
+    torch.testing.assert_close(rounded(0, 3), first, rtol=0, atol=0)
+    assert not torch.equal(rounded(1, 3), first) and not torch.equal(rounded(0, 3 + MADE_FRAMES), first)
+
+
 def test_what_made_frames_reach_has_a_gradient(network: Lean) -> None:
     """A grey clip alone would leave a kernel of differences without one."""
     grey = Planes(*(torch.full(shape, 128.0) for shape in ((1, 1, 1, 16, 24), (1, 1, 1, 8, 12), (1, 1, 1, 8, 12))))
-    torch.manual_seed(1)
-    with RoundedFeatures(network)(0):
+    with RoundedFeatures(network, 1)(0):
         picture, _ = network(grey)
     (picture.y - 100).square().mean().backward()
     stem = network.stem.weight.grad
@@ -83,7 +95,7 @@ def test_what_made_frames_reach_has_a_gradient(network: Lean) -> None:
 def test_an_error_inside_leaves_nothing_rounded_behind(network: Lean) -> None:
     clip = Planes(*(plane.float() for plane in random_clip(1, 1, 8, 8)))
     exact = features_of(network, clip)
-    with pytest.raises(ZeroDivisionError), RoundedFeatures(network)(0):
+    with pytest.raises(ZeroDivisionError), RoundedFeatures(network, 0)(0):
         raise ZeroDivisionError
     torch.testing.assert_close(features_of(network, clip), exact, rtol=0, atol=0)
 
@@ -91,7 +103,7 @@ def test_an_error_inside_leaves_nothing_rounded_behind(network: Lean) -> None:
 @pytest.mark.parametrize("preset", ["planes", "paper", "srvgg"])
 def test_a_network_without_such_features_is_refused(preset: str) -> None:
     with pytest.raises(InputError, match="only fast, live and balanced, wide or not, can be trained for 8 bits"):
-        RoundedFeatures(random_network(preset))
+        RoundedFeatures(random_network(preset), 0)
 
 
 def test_a_run_for_8_bits_trains_and_says_so(tmp_path: Path) -> None:

@@ -1,9 +1,10 @@
-"""Training: footage lists, degradation, sampling, and a run that resumes to the same weights."""
+"""Training: footage lists, degradation, sampling, and what a run needs."""
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,16 @@ import pytest
 import torch
 
 from client.cloud import CloudEncoder, CloudSettings, area_downscale, through_codec
-from client.errors import InputError, ModelError
-from client.frames import Frame
+from client.errors import InputError
+from client.frames import Frame, plane_shapes
 from model.cli import train_main
-from model.footage import Degradation, FootageCache, by_game, load_pairs, load_scenes, sample_clips
+from model.export_cli import main as export_main
+from model.footage import Degradation, FootageCache, load_pairs, load_scenes
 from model.losses import LOSSES, mean_log_mse
 from model.planes import Planes
+from model.sampling import by_game, sample_clips
 from model.train import TrainConfig, Trainer, load_checkpoint, network_of
-from tests.moving import picture, write_footage
+from tests.moving import picture, scene, write_footage
 
 
 @pytest.fixture(scope="module")
@@ -28,21 +31,6 @@ def footage(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 TINY = TrainConfig(degradations=("area", "area@300"), steps=8, batch=2, patch=16, frames=4, window=2, warm_up_steps=2)
-
-
-def test_a_resumed_run_ends_at_the_same_weights(footage: Path, tmp_path: Path) -> None:
-    cache = FootageCache(tmp_path / "cache")
-    Trainer(TINY, footage, cache, tmp_path / "whole").run(validate_every=100, progress=False)
-    stopped = Trainer(TINY, footage, cache, tmp_path / "parts")
-    losses = stopped.losses()
-    for _ in range(4):
-        next(losses)
-    stopped.save()
-    Trainer(TINY, footage, cache, tmp_path / "parts").run(validate_every=100, progress=False)
-    whole, parts = (load_checkpoint(tmp_path / name / "checkpoint.pt") for name in ("whole", "parts"))
-    assert whole["step"] == parts["step"] == 8
-    for name, weight in whole["network"].items():
-        assert torch.equal(weight, parts["network"][name]), name
 
 
 def test_the_psnr_loss_is_psnr_yuv_of_the_clips_turned_round() -> None:
@@ -102,6 +90,35 @@ def test_the_command_trains_logs_and_refuses_another_configuration(
     network_of(load_checkpoint(run / "checkpoint.pt"))
 
 
+def test_an_identical_picture_has_no_psnr_in_the_log_and_on_the_page(footage: Path, make_clip: Callable[..., Path], tmp_path: Path) -> None:
+    """A film that begins black is as black by bicubic."""
+    black = Frame(*(np.full(shape, level, np.uint8) for shape, level in zip(plane_shapes(72, 96), (16, 128, 128), strict=True)))
+    make_clip("dark.mkv", width=96, height=72, pictures=[black] * 12)
+    films = scene("one", "a", "train", str(footage.with_name("clip.mkv"))) + scene("dark", "a", "validate", "dark.mkv")
+    (tmp_path / "footage.toml").write_text(films)
+    tiny = ["--steps", "4", "--batch", "2", "--patch", "16", "--frames", "4", "--window", "2", "--degradations", "area"]
+    assert train_main([str(tmp_path / "footage.toml"), str(tmp_path / "run"), "--cache", str(tmp_path / "cache"), *tiny]) == 0
+    (row,) = (json.loads(line, parse_constant=pytest.fail) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines())
+    assert row["held_out"]["a/dark area"]["bicubic_db"] is None
+    assert export_main([str(tmp_path / "run" / "checkpoint.pt"), "mine", "--folder", str(tmp_path)]) == 0
+    page = (tmp_path / "mine_x2.md").read_text()
+    assert "| a/dark area | identical | " in page and " | undefined |\n" in page
+
+
+@pytest.mark.parametrize("rate", ["-1", "0", "nan", "inf"])
+def test_a_learning_rate_that_is_none_is_refused(footage: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], rate: str) -> None:
+    command = [str(footage), str(tmp_path / "run"), "--cache", str(tmp_path / "cache"), "--learning-rate", rate]
+    assert train_main(command) == 1
+    assert capsys.readouterr().err == f"gamesr-train: the learning rate is a number above 0, not {float(rate)}\n"
+
+
+@pytest.mark.parametrize("device", ["foo", "meta", "cuda:99"])
+def test_a_device_that_is_not_there_is_refused(footage: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], device: str) -> None:
+    assert train_main([str(footage), str(tmp_path / "run"), "--cache", str(tmp_path / "cache"), "--device", device]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f"gamesr-train: torch cannot compute on the device {device!r}: ") and said.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
@@ -119,17 +136,18 @@ def test_footage_that_does_not_suffice_is_refused_before_training(
 
 
 def test_what_cannot_be_written_to_its_end_leaves_nothing(footage: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(first: object, second: object) -> None:
-        path = first if isinstance(first, Path) else second
-        assert isinstance(path, Path)
-        path.write_bytes(b"half")
+    def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
+
+    def full_after(state: object, path: Path) -> None:
+        path.write_bytes(b"half")
+        full()
 
     cache = FootageCache(tmp_path / "cache")
     trainer = Trainer(TINY, footage, cache, tmp_path / "run")
     kept = sorted(tmp_path.rglob("*"))
-    monkeypatch.setattr(torch, "save", full)
-    monkeypatch.setattr(np, "save", full)
+    monkeypatch.setattr(torch, "save", full_after)
+    monkeypatch.setattr(np.lib.format, "write_array_header_1_0", full)
     for write in (trainer.save, lambda: cache.degraded(load_scenes(footage, split="test")[0], 3, Degradation("area"))):
         with pytest.raises(OSError, match="No space"):
             write()
@@ -234,9 +252,3 @@ def test_a_bad_footage_list_is_refused(tmp_path: Path, content: str, reason: str
     (tmp_path / "footage.toml").write_text(content)
     with pytest.raises(InputError, match=reason):
         load_scenes(tmp_path / "footage.toml", split="train")
-
-
-def test_a_file_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "checkpoint.pt").write_bytes(b"nothing")
-    with pytest.raises(ModelError, match="not a checkpoint"):
-        load_checkpoint(tmp_path / "checkpoint.pt")

@@ -10,10 +10,12 @@ import pytest
 
 from client.cloud import NetworkSettings
 from client.errors import InputError
+from client.models import find_model
 from client.reference import Reference
 from client.stream_source import EncodedLive
 from client.video import VideoSource, read_frames
 from model.footage import Degradation, FootageCache, Scene
+from model.quantize import quantize
 from server.encoding import clip_frames
 from server.probe import probe
 from server.settings import Limits
@@ -34,14 +36,19 @@ def as_native_render(path: Path) -> None:
     FootageCache(path.parent / "cache").degraded(Scene("s", "g", "test", 30, twice, {HEIGHT: path}), 2, Degradation("native"))
 
 
+def as_calibration(path: Path) -> None:
+    quantize(find_model("fast", 2), path.with_name("int8.onnx"), [path], name="int8", frames=2 * FRAMES, made_frames=1)
+
+
 READERS: list[Callable[[Path], object]] = [
     as_reference,
     lambda path: list(clip_frames(path, 1, None)),
     lambda path: FootageCache(path.parent / "cache").reference(Scene("s", "g", "test", 30, path)),
     as_native_render,
     lambda path: probe(path, Limits(), whole=True),
+    as_calibration,
 ]
-each_reader = pytest.mark.parametrize("read", READERS, ids=["reference", "sweep", "footage", "native", "probe"])
+each_reader = pytest.mark.parametrize("read", READERS, ids=["reference", "sweep", "footage", "native", "probe", "calibration"])
 
 
 @pytest.fixture
@@ -60,7 +67,7 @@ def two_sizes(make_clip: MakeClip, tmp_path: Path) -> Path:
 @pytest.mark.parametrize("refused_packet", [True, False])
 def test_a_damaged_film_is_refused(read: Callable[[Path], object], make_clip: MakeClip, twice: Path, refused_packet: bool) -> None:
     """Whether its decoder refuses a packet or only marks the picture that it made of one."""
-    path = make_clip("clip.mkv")
+    path = make_clip("clip.mkv", frames=2 * FRAMES)
     with av.open(str(path)) as container:
         packet = [bytes(packet) for packet in container.demux(video=0) if packet.size][8]
     kept = 0 if refused_packet else len(packet) // 2
