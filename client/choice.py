@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from client.cores import has_amx
-from client.runtime import OPENVINO, computes_in, computes_in_8_bits, is_installed
+from client.runtime import OPENVINO, computes_in, is_installed
 
 AUTO = "auto"
 FLOAT_TIERS = ("quality", "balanced", "live", "fast", "bicubic")
@@ -20,6 +20,6 @@ def chosen_provider() -> str:
 def chosen_tiers(provider: str) -> list[str]:
     """Models to move between, the best first, for one of PROVIDERS.
 
-    8 bits are the fast ones in OpenVINO on processors without AMX, as long as these have VNNI or its like.
+    8 bits are the fast ones in OpenVINO on processors without AMX.
     """
-    return list(INT8_TIERS if provider in OPENVINO and not has_amx() and computes_in_8_bits() else FLOAT_TIERS)
+    return list(INT8_TIERS if provider in OPENVINO and not has_amx() else FLOAT_TIERS)

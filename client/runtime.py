@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from client.artifact import ORT_PROVIDERS, ModelSpec, load_session, read_artifact
 from client.cuda import CUDA
-from client.eight_bits import FLOAT_INSTEAD, adds_up, is_in_8_bits
 from client.errors import ModelError, ProviderError, how_to_install
+from client.int8_weights import MOST, sums_fit
 from client.norms import norms_in_place
 from client.precise import states_in_float32
 
@@ -131,16 +131,10 @@ def computes_in(provider: str) -> bool:
     return CAPABILITIES[OPENVINO[provider]] in _core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
 
 
-def computes_in_8_bits() -> bool:
-    """Whether OpenVINO multiplies in 8 bits as it should on this processor; raises ProviderError where it is not installed."""
-    return adds_up(openvino(), _core())
-
-
 class OpenVinoRuntime:
     """A graph compiled by OpenVINO for every size that it is used at, since fixed sizes save a third of a small network's time.
 
-    `provider` is one of OPENVINO: the inner layers compute in its precision; inputs, outputs and the state stay as they are. What is in 8
-    bits is multiplied in float where the processor would cut off sums of them. With
+    `provider` is one of OPENVINO: the inner layers compute in its precision; inputs, outputs and the state stay as they are. With
     `counting` a request knows what each operation took. Raises ProviderError where the processor does not have the precision.
     """
 
@@ -176,13 +170,14 @@ class OpenVinoRuntime:
                 self._compiled.pop(next(iter(self._compiled)))  # streams of that size keep what they have
             try:
                 model = self._core.read_model(self._content)
+                if not sums_fit(model):
+                    raise ValueError(f"its 8-bit weights go beyond {MOST}, whose sums some processors cut off: quantize it again")
                 if self._precision != "f16":  # where it has not been measured
                     norms_in_place(self._ov, model)
                 model.reshape({name: list(shape) for name, shape in shapes.items()})
                 if self._precision == "bf16":
                     model = states_in_float32(self._ov, self._core, model)
-                instead = FLOAT_INSTEAD if is_in_8_bits(model) and not adds_up(self._ov, self._core) else {}
-                self._compiled[key] = self._core.compile_model(model, "CPU", {**self._options, **instead}).create_infer_request()
+                self._compiled[key] = self._core.compile_model(model, "CPU", self._options).create_infer_request()
             except Exception as error:  # the runtime's exceptions have no common base
                 reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
                 raise ModelError(f"OpenVINO cannot compile the model: {reason}") from error

@@ -20,16 +20,18 @@ from onnx import helper, numpy_helper
 from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
 
 from client.artifact import ModelSpec, load_session
-from client.errors import InputError, ModelError
+from client.errors import ModelError
 from client.frames import Frame, plane_shapes
 from client.upscaler import copy_padded
-from client.video import read_frames
+from client.video import VideoSource
+from client.whole_frames import whole_frames
 from model.artifact_files import Page, write_artifact
 from model.artifact_weights import network_of_artifact
 from model.calibration import MADE, MADE_FRAMES, Feeds, Made, even_channels, mean_difference
 from model.catalogue import described_network
 from model.export import export_network
 from model.lean import ARCHITECTURE, MIDDLE, Lean
+from model.seven_bits import settle_weights
 
 # Not the gates, whose error the state would keep; not what interpolates, which makes the code values themselves; and not a head
 # whose base is apart: a residual of rare large values in 8 bits is what lost most, and such a head is a twentieth of the work.
@@ -54,10 +56,10 @@ def quantize(
 
     `clips` are videos of the artifact's input, low resolution and compressed as they will be; the ranges of the features are
     the smallest and the largest value in the first `frames` frames of each, and in `made_frames` frames of each of `MADE`. Weights
-    are symmetric, a scale for each output channel, features unsigned with one scale and zero point for a tensor (signed ones take
-    twice as long in both runtimes), of which every channel is made to use all (`even_channels`). What 8 bits do to the mean of the
-    clips' pictures is taken back in a `model.lean` network. Raises ModelError for an artifact that is not a float32 network of
-    ours and InputError for a clip without frames.
+    are symmetric, a scale for each output channel, of 7 bits (`model.seven_bits`); features unsigned with one scale and zero point for
+    a tensor (signed ones take twice as long in both runtimes), of which every channel is made to use all (`even_channels`). What 8
+    bits do to the mean of the clips' pictures is taken back in a `model.lean` network. Raises ModelError for an artifact that is not a
+    float32 network of ours and InputError for a clip without frames.
     """
     _, spec = load_session(artifact, "cpu", 1)
     if spec.precision != "float32":
@@ -80,6 +82,7 @@ def quantize(
                 op_types_to_quantize=["Conv", *JOINING],
                 nodes_to_quantize=nodes,
                 per_channel=True,
+                reduce_range=True,  # weights up to 64
                 activation_type=QuantType.QUInt8,
                 weight_type=QuantType.QInt8,
                 extra_options={"TensorQuantOverrides": _exact_codes(model.graph) if residuals else {}},
@@ -87,6 +90,7 @@ def quantize(
         quantized = onnx.load(whole)
     for tensor in left_float:
         leave_float(quantized.graph, tensor)
+    settle_weights(model, quantized, lambda: _Footage(spec, clips, frames))
     for residual, bias in residuals.items():
         lost = mean_difference(model, quantized, residual, _Footage(spec, clips, frames))
         tensor = next(tensor for tensor in quantized.graph.initializer if tensor.name == bias)
@@ -119,11 +123,10 @@ class _Footage(CalibrationDataReader):  # type: ignore[misc]
         self.played.clear()
         for clip in self._clips:
             count = 0
-            for frame in islice(read_frames(clip), self._most):
-                yield _feeds(frame, self._spec)
-                count += 1
-            if count == 0:
-                raise InputError(f"no frame of {clip} could be decoded")
+            with VideoSource(clip) as source:
+                for frame in islice(whole_frames(source, "is damaged: nothing can be calibrated on it"), self._most):
+                    yield _feeds(frame, self._spec)
+                    count += 1
             self.played.append(f"{clip.name} ({count} frames)")
         for made, width, height in self._made:
             for frame in made(width, height, self._made_frames):

@@ -29,11 +29,8 @@ def test_amx_is_what_the_system_tells_of(told: str | None, amx: bool, tmp_path: 
         cores.CPUINFO.write_text(told)
     assert cores.has_amx() == amx
     assert cores.machine_name() == "A" or "model name" not in (told or "")
-    for adds_up in (True, False):
-        monkeypatch.setattr(choice, "computes_in_8_bits", lambda adds_up=adds_up: adds_up)
-        for provider in PROVIDERS:
-            in_8_bits = provider.startswith("openvino") and not amx and adds_up
-            assert chosen_tiers(provider) == list(INT8_TIERS if in_8_bits else FLOAT_TIERS)
+    for provider in PROVIDERS:
+        assert chosen_tiers(provider) == list(INT8_TIERS if provider.startswith("openvino") and not amx else FLOAT_TIERS)
 
 
 def test_the_runtime_is_the_best_that_is_there() -> None:
