@@ -180,7 +180,8 @@ class Refit:
         planes = list(self._planes())
         shares = shares_of(list(self.train), degradations)
         reach = np.max([sums.reach for sums in self.train.values()], 0)
-        train = [sums.rounded(reach, self._weights()) for sums in self.train.values()]
+        weights = self._weights()
+        train = [sums.rounded(reach, weights) for sums in self.train.values()]
         changes = [solved(zip(shares, train, strict=True), plane) for plane in planes]
         self._add(torch.from_numpy(np.concatenate(changes, 1).T / self.layer.gain).float())
         return {
